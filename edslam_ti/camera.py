@@ -1,0 +1,61 @@
+"""Pinhole camera with pixel centres at integer coordinates: x right, y down, z forward."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.errors import DataError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Undistorted pinhole intrinsics in pixels; (0, 0) is the centre of the top left pixel."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise DataError(f"camera: expected a positive size, got {self.width}x{self.height}")
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
+            raise DataError(
+                f"camera: expected finite fx, fy, cx, cy with positive focal lengths, got {values}"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), the shape of its images."""
+        return self.height, self.width
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy)."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def matrix(self) -> np.ndarray:  # [3, 3]
+        """The intrinsic matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def downscaled(self, factor: int) -> "Camera":
+        """Return the camera of an image averaged over factor x factor blocks (odd edges cut off)."""
+        # Block k covers pixels factor*k .. factor*k + factor - 1, whose centre is factor*k + (factor-1)/2.
+        shift = (factor - 1) / 2
+        return Camera(
+            self.width // factor,
+            self.height // factor,
+            self.fx / factor,
+            self.fy / factor,
+            (self.cx - shift) / factor,
+            (self.cy - shift) / factor,
+        )
+
+    def rays(self) -> np.ndarray:  # [H, W, 3]
+        """Return the viewing ray of every pixel, scaled to z = 1 (point = depth * ray)."""
+        v, u = np.mgrid[0 : self.height, 0 : self.width].astype(np.float64)
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], -1)

@@ -1,0 +1,161 @@
+"""Every setting, one validated model per stage: default, unit and source beside each field.
+
+Files and flags state differences only; a key that is unknown, or a value out of range, is an error
+that names the field.
+"""
+
+import difflib
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from edslam_ti.errors import ConfigError
+
+
+class Stage(BaseModel):
+    """Base of every stage's settings: immutable, no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class TimeSurfaceConfig(Stage):
+    """Time surface, Eq. 1."""
+
+    decay: float = Field(0.03, gt=0)
+    """tau in Eq. 1 (the text also calls it eta), seconds. Not given in the paper; ESVO uses 0.03."""
+    blur: float = Field(1.0, ge=0)
+    """Standard deviation in pixels of the Gaussian that smooths the surface before alignment."""
+
+
+class TrackingConfig(Stage):
+    """Bidirectional patch tracker, Sec. III-B."""
+
+    num_patches: int = Field(400, ge=1)
+    """Patches per direction: the best row of Table II (the text says 200)."""
+    patch_size: int = Field(9, ge=1, le=31)
+    """Side p of a patch in pixels, odd (Table I)."""
+    min_time_surface: float = Field(0.3, ge=0, lt=1)
+    """Patch centres are drawn where the surface exceeds this (tau in Sec. III-B; not given there)."""
+    max_depth_difference: float = Field(0.1, gt=0)
+    """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
+
+
+class KeyframeConfig(Stage):
+    """When an event chunk becomes a keyframe, and what it keeps (Sec. III-E)."""
+
+    num_chunks: int = Field(5, ge=1)
+    """N: event chunks stored with a keyframe."""
+
+
+class MappingConfig(Stage):
+    """Gaussian map, its losses and its optimiser (Sec. III-C to III-E)."""
+
+    enabled: bool = True
+    """False: track only, build no map."""
+
+
+class EvaluationConfig(Stage):
+    """Image metrics at poses held out from mapping."""
+
+    hold_out_every: int = Field(5, ge=2)
+    """Every n-th frame is held out: its depth and its exact time stamp are never used for mapping."""
+    max_images: int = Field(20, ge=1)
+    """At most this many held-out views are rendered and compared."""
+    lpips_weights: Path | None = None
+    """LPIPS weights (AlexNet backbone and linear heads in one torch state dict)."""
+
+
+class Config(Stage):
+    """All settings of a run."""
+
+    scene: str = Field("office0", min_length=1)
+    """Sequence: a folder name under the data folder, or a built-in room."""
+    dataset: Literal["event_replica", "rpg", "builtin"] | None = None
+    """Input format; omitted: EventReplica when found under the data folder, else the built-in room."""
+    data_dir: Path = Path("data")
+    """Folder that holds the sequences."""
+    method: str = "ed_slam"
+    """What runs: ed_slam, ed_slam_paper (Eq. 5 to the letter), open3d_rgbd."""
+    start: float = Field(0.0, ge=0)
+    """Seconds of the sequence to skip."""
+    duration: float | None = Field(None, gt=0)
+    """Seconds of the sequence to use; omitted: to its end."""
+    poses: Literal["tracked", "truth"] = "tracked"
+    """truth: skip tracking and map with the true poses."""
+    contrast_threshold: float | None = Field(None, gt=0)
+    """C in Eq. 11; omitted: the data set's own (camera.json), else 0.1 synthetic, 0.2 real (Sec. IV-A)."""
+    max_interval: float = Field(0.1, gt=0)
+    """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
+    out: Path = Path("results")
+    """Folder that receives the results."""
+    visualize: bool = False
+    """Follow the run in an Open3D window."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the kernels run."""
+    threads: int = Field(2, ge=1)
+    """CPU threads of the kernels; results are identical for the same number."""
+    seed: int = Field(0, ge=0)
+    """Seed of every random choice."""
+    time_surface: TimeSurfaceConfig = TimeSurfaceConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    def updated(self, differences: dict[str, Any]) -> Self:
+        """Return these settings with (nested) differences applied and validated."""
+        return type(self)._validated(merged(self.model_dump(), differences), source="settings")
+
+    @classmethod
+    def _validated(cls, values: dict[str, Any], source: str) -> Self:
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise ConfigError(f"{source}: {_first_problem(cls, error)}") from error
+
+    def to_yaml(self) -> str:
+        """Return every value as YAML, loadable with --config."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def read_differences(path: Path) -> dict[str, Any]:
+    """Read a settings file (YAML mapping of differences) and check its keys and values."""
+    if not path.is_file():
+        raise ConfigError(f"{path}: settings file not found")
+    try:
+        values = yaml.safe_load(path.read_text()) or {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{path}: not readable as YAML ({' '.join(str(error).split())})"
+        ) from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected a mapping 'key: value', got {type(values).__name__}")
+    Config._validated(merged(Config().model_dump(), values), source=str(path))
+    return values
+
+
+def merged(base: dict[str, Any], differences: dict[str, Any]) -> dict[str, Any]:
+    """Return `base` with the (nested) differences written over it."""
+    result = dict(base)
+    for key, value in differences.items():
+        old = result.get(key)
+        result[key] = (
+            merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+        )
+    return result
+
+
+def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
+    """Return one line on the first problem; an unknown key comes with its nearest valid name."""
+    problem = error.errors()[0]
+    name = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] != "extra_forbidden":
+        return f"{name}: {problem['msg']}, got {problem['input']!r}"
+    stage: Any = model
+    for part in problem["loc"][:-1]:
+        stage = stage.model_fields[part].annotation
+    close = difflib.get_close_matches(str(problem["loc"][-1]), stage.model_fields, n=1)
+    hint = f"; did you mean '{close[0]}'?" if close else f"; known: {', '.join(stage.model_fields)}"
+    return f"unknown key '{name}'{hint}"

@@ -1,0 +1,128 @@
+"""What every sequence offers, and how it is cut into samples."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError
+from edslam_ti.events import Events
+from edslam_ti.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One step of the main loop: the events since the last step and the depth image at its end."""
+
+    timestamp: float  # seconds from the start of the sequence
+    events: Events  # from the last sample's time stamp (included) to this one's (excluded)
+    depth: np.ndarray | None  # [H, W] float32 metres, 0 = missing; None between depth images
+    image: np.ndarray | None = None  # [H, W] float32 in [0, 1], for evaluation and RGB-D baselines
+    T_world_camera: np.ndarray | None = None  # [4, 4] truth, for evaluation only
+
+
+class EventDepthSequence(ABC):
+    """Streams of events and depth, with images and true poses where the data has them.
+
+    Constructors validate what they can see without reading everything, and raise `DataError` or
+    `FileNotFoundError`; reading methods raise `DataError` on what only then shows.
+    """
+
+    dataset: str
+    scene: str
+    camera: Camera
+    contrast_threshold: float | None  # C of Eq. 11 when the data states it
+    truth: Trajectory | None  # true poses
+    depth_timestamps: np.ndarray  # [D] seconds, strictly increasing
+    image_timestamps: np.ndarray  # [I] seconds, strictly increasing; may be empty
+    description: str  # one line: what this is; a stand-in says so
+
+    @abstractmethod
+    def depth(self, index: int) -> np.ndarray:
+        """Return depth image `index` as [H, W] float32 metres, 0 = missing."""
+
+    @abstractmethod
+    def image(self, index: int) -> np.ndarray:
+        """Return grey image `index` as [H, W] float32 in [0, 1], undistorted."""
+
+    @abstractmethod
+    def events(self, start: float, end: float) -> Events:
+        """Return the events with start <= t < end, sorted, inside the image, undistorted."""
+
+    @property
+    @abstractmethod
+    def time_range(self) -> tuple[float, float]:
+        """Times of the first and the last event in seconds."""
+
+    def image_at(self, timestamp: float, tolerance: float = 1e-3) -> np.ndarray | None:
+        """Return the image taken within `tolerance` seconds of a time, if there is one."""
+        if len(self.image_timestamps) == 0:
+            return None
+        k = int(np.abs(self.image_timestamps - timestamp).argmin())
+        return self.image(k) if abs(self.image_timestamps[k] - timestamp) <= tolerance else None
+
+    def true_pose(self, timestamp: float) -> np.ndarray | None:
+        """Return the true pose at a time inside the recorded path (Eq. 9 between its stamps)."""
+        if self.truth is None or not self.truth.covers(timestamp):
+            return None
+        return self.truth.at(timestamp)
+
+
+class SampledSequence:
+    """A sequence cut to [start, start + duration] and divided into samples.
+
+    A sample ends at every depth image; gaps longer than `max_interval` are divided evenly by samples
+    without depth.
+    """
+
+    def __init__(
+        self,
+        sequence: EventDepthSequence,
+        start: float,
+        duration: float | None,
+        max_interval: float,
+    ) -> None:
+        self.sequence = sequence
+        first, last = sequence.time_range
+        end = np.inf if duration is None else start + duration
+        # Depth far outside the event stream has nothing to be tracked with.
+        stamps = sequence.depth_timestamps
+        inside = stamps[(stamps >= start - 1e-9) & (stamps <= end + 1e-9)]
+        inside = inside[(inside >= first - max_interval) & (inside <= last + max_interval)]
+        if len(inside) < 2:
+            depth_range = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else "nothing"
+            raise DataError(
+                f"{sequence.scene}: expected at least 2 depth images between {start} s and "
+                f"{end if np.isfinite(end) else last:.3f} s, got {len(inside)}; depth covers {depth_range}, "
+                f"events {first:.3f} to {last:.3f} s; change --start or --duration"
+            )
+        times, has_depth = [float(inside[0])], [True]
+        for a, b in zip(inside[:-1], inside[1:]):
+            pieces = int(np.ceil((b - a) / max_interval - 1e-6))
+            times += [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
+            has_depth += [False] * (pieces - 1) + [True]
+        self.timestamps = np.array(times)  # [S]
+        self.has_depth = np.array(has_depth)  # [S] bool
+        self._depth_index = np.searchsorted(stamps, self.timestamps, side="left")
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, k: int) -> Sample:
+        if not 0 <= k < len(self):
+            raise IndexError(k)
+        t = float(self.timestamps[k])
+        # The first sample gets a little history so that its time surface is not empty.
+        previous = float(self.timestamps[k - 1]) if k else t - 0.1
+        return Sample(
+            timestamp=t,
+            events=self.sequence.events(previous, t),
+            depth=self.sequence.depth(int(self._depth_index[k])) if self.has_depth[k] else None,
+            image=self.sequence.image_at(t),
+            T_world_camera=self.sequence.true_pose(t),
+        )

@@ -1,0 +1,109 @@
+"""SE(3) on torch tensors of any batch shape.
+
+Poses are 4x4 matrices `T_a_b` that map points of frame b into frame a. Twists are 6-vectors in the
+order (translation, rotation). Formulas: Barfoot, State Estimation for Robotics, ch. 7; the small-angle
+branches are Taylor series, so that values and gradients stay right at and below 1e-7 rad.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SMALL_ANGLE_SQUARED = 1e-6  # rad^2; the fourth-order series below is exact to 1e-16 there
+
+
+def skew(w: Tensor) -> Tensor:  # [..., 3] -> [..., 3, 3], skew(w) @ v = w x v
+    """Return the cross-product matrix of each vector."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def _exp_coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3."""
+    small = theta_squared < SMALL_ANGLE_SQUARED
+    safe = torch.where(small, torch.ones_like(theta_squared), theta_squared)
+    theta = safe.sqrt()
+    t2 = theta_squared
+    a = torch.where(small, 1 - t2 / 6 + t2 * t2 / 120, theta.sin() / theta)
+    b = torch.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, (1 - theta.cos()) / safe)
+    c = torch.where(
+        small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (theta - theta.sin()) / (safe * theta)
+    )
+    return a, b, c
+
+
+def se3_exp(twist: Tensor) -> Tensor:  # [..., 6] -> [..., 4, 4]
+    """Return the rigid motion exp(twist)."""
+    v, w = twist[..., :3], twist[..., 3:]
+    W = skew(w)
+    W2 = W @ W
+    a, b, c = (x[..., None, None] for x in _exp_coefficients((w * w).sum(-1)))
+    eye = torch.eye(3, dtype=twist.dtype, device=twist.device)
+    rotation = eye + a * W + b * W2
+    translation = ((eye + b * W + c * W2) @ v[..., None])[..., 0]
+    return from_rotation_translation(rotation, translation)
+
+
+def se3_log(T: Tensor) -> Tensor:  # [..., 4, 4] -> [..., 6]
+    """Return the twist of each rigid motion; rotations by pi have no unique logarithm."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    vee = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
+    sine2 = 0.25 * (vee * vee).sum(-1)  # sin^2(theta)
+    cosine = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+    small = (sine2 < SMALL_ANGLE_SQUARED) & (cosine > 0)
+    safe_sine = torch.where(small, torch.ones_like(sine2), sine2).clamp_min(1e-24).sqrt()
+    theta = torch.atan2(safe_sine, cosine)
+    # theta / (2 sin theta), as a series in sin^2 near zero: asin(s)/s = 1 + s^2/6 + 3 s^4/40 + ...
+    scale = torch.where(small, 0.5 + sine2 / 12 + 3 * sine2 * sine2 / 80, 0.5 * theta / safe_sine)
+    w = scale[..., None] * vee
+    W = skew(w)
+    _, b, _ = _exp_coefficients((w * w).sum(-1))
+    theta2 = (w * w).sum(-1)
+    a, _, _ = _exp_coefficients(theta2)
+    near = theta2 < 1e-4
+    safe2 = torch.where(near, torch.ones_like(theta2), theta2)
+    d = torch.where(
+        near, 1 / 12 + theta2 / 720 + theta2 * theta2 / 30240, (1 - a / (2 * b)) / safe2
+    )
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    v = ((eye - 0.5 * W + d[..., None, None] * (W @ W)) @ t[..., None])[..., 0]
+    return torch.cat([v, w], -1)
+
+
+def from_rotation_translation(
+    R: Tensor, t: Tensor
+) -> Tensor:  # [..., 3, 3], [..., 3] -> [..., 4, 4]
+    """Return the 4x4 matrix [R t; 0 1]."""
+    top = torch.cat([R, t[..., None]], -1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device)
+    return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], -2)
+
+
+def inverse(T: Tensor) -> Tensor:  # [..., 4, 4]
+    """Return the inverse rigid motion, from the transposed rotation."""
+    R_t = T[..., :3, :3].transpose(-1, -2)
+    return from_rotation_translation(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
+
+
+def interpolate(T_start: Tensor, T_end: Tensor, fraction: Tensor | float) -> Tensor:
+    """Return T_start exp(fraction log(T_start^-1 T_end)), the geodesic of Eq. 9; extrapolates too."""
+    twist = se3_log(inverse(T_start) @ T_end)
+    u = torch.as_tensor(fraction, dtype=twist.dtype, device=twist.device)
+    return T_start @ se3_exp(u[..., None] * twist if u.ndim else u * twist)
+
+
+def orthonormalized(T: np.ndarray) -> np.ndarray:  # [4, 4]
+    """Return the nearest rigid motion (SVD), which removes the drift of long products."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    result = np.eye(4)
+    result[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    result[:3, 3] = T[:3, 3]
+    return result
+
+
+def rotation_angle_deg(T: np.ndarray) -> float:  # [4, 4] -> degrees
+    """Return the angle of the rotation part."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1.0, 1.0))))

@@ -1,0 +1,30 @@
+"""The one place that imports Open3D: lazily, and with libusb-1.0 supplied where the system lacks it."""
+
+import ctypes
+import ctypes.util
+from functools import cache
+from types import ModuleType
+
+from edslam_ti.errors import EdSlamError
+
+
+@cache
+def load_open3d() -> ModuleType:
+    """Return the `open3d` module.
+
+    Open3D links against libusb-1.0, which a stock Debian/Ubuntu does not have; the PyPI package
+    `libusb-package` carries the same library, and loading it first satisfies the linker.
+    """
+    if ctypes.util.find_library("usb-1.0") is None:
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    try:
+        import open3d
+    except ImportError as error:
+        raise EdSlamError(
+            f"Open3D could not be loaded ({error}); on a minimal Linux install its graphics "
+            "libraries: apt-get install libgl1 libegl1 libx11-6"
+        ) from error
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d

@@ -1,0 +1,123 @@
+"""A camera path: key poses over time, interpolated along geodesics (Eq. 9), read and written as TUM."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from edslam_ti.errors import DataError
+from edslam_ti.geometry import interpolate
+from edslam_ti.output import atomic_file
+
+
+class Trajectory:
+    """Poses `T_world_camera` [F, 4, 4] at strictly increasing times [F] in seconds."""
+
+    def __init__(
+        self, timestamps: np.ndarray | None = None, poses: np.ndarray | None = None
+    ) -> None:
+        self._timestamps: list[float] = [] if timestamps is None else [float(t) for t in timestamps]
+        self._poses: list[np.ndarray] = (
+            [] if poses is None else [np.array(p, np.float64) for p in poses]
+        )
+        if len(self._timestamps) != len(self._poses):
+            raise DataError(
+                f"trajectory: expected one pose per time stamp, got {len(self._timestamps)} time "
+                f"stamps and {len(self._poses)} poses"
+            )
+        if np.any(np.diff(self._timestamps) <= 0):
+            raise DataError(
+                "trajectory: expected strictly increasing time stamps; sort or deduplicate them"
+            )
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def timestamps(self) -> np.ndarray:  # [F]
+        return np.array(self._timestamps)
+
+    @property
+    def poses(self) -> np.ndarray:  # [F, 4, 4]
+        return np.array(self._poses).reshape(-1, 4, 4)
+
+    def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
+        """Add a pose later than all others."""
+        if self._timestamps and timestamp <= self._timestamps[-1]:
+            raise DataError(f"trajectory: {timestamp} s is not later than {self._timestamps[-1]} s")
+        self._timestamps.append(float(timestamp))
+        self._poses.append(np.array(T_world_camera, np.float64))
+
+    def replace(self, index: int, T_world_camera: np.ndarray) -> None:
+        """Overwrite one pose (bundle adjustment)."""
+        self._poses[index] = np.array(T_world_camera, np.float64)
+
+    def covers(self, timestamp: float, tolerance: float = 1e-6) -> bool:
+        """Return whether `at` would interpolate, not extrapolate."""
+        return bool(self._poses) and (
+            self._timestamps[0] - tolerance <= timestamp <= self._timestamps[-1] + tolerance
+        )
+
+    def at(self, timestamp: float) -> np.ndarray:  # [4, 4]
+        """Return the pose at a time: Eq. 9 inside the path, constant velocity beyond its ends."""
+        if not self._poses:
+            raise DataError("trajectory: no pose yet")
+        if len(self._poses) == 1:
+            return self._poses[0].copy()
+        k = int(np.searchsorted(self._timestamps, timestamp, side="right")) - 1
+        k = min(max(k, 0), len(self._poses) - 2)
+        start, end = self._timestamps[k], self._timestamps[k + 1]
+        pose = interpolate(
+            torch.from_numpy(self._poses[k]),
+            torch.from_numpy(self._poses[k + 1]),
+            (timestamp - start) / (end - start),
+        )
+        return pose.numpy()
+
+    def predict(self, timestamp: float) -> np.ndarray:  # [4, 4]
+        """Return the pose expected at a later time under constant velocity."""
+        return self.at(timestamp)
+
+    def resampled(self, timestamps: np.ndarray) -> "Trajectory":
+        """Return the path at other times (strictly increasing)."""
+        return Trajectory(timestamps, np.array([self.at(t) for t in timestamps]))
+
+    def length(self) -> float:
+        """Return the length of the path in metres."""
+        positions = self.poses[:, :3, 3]
+        return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world)."""
+    with atomic_file(path) as temporary, temporary.open("w") as file:
+        file.write("# timestamp tx ty tz qx qy qz qw\n")
+        for t, T in zip(trajectory.timestamps, trajectory.poses):
+            q = Rotation.from_matrix(T[:3, :3]).as_quat()
+            file.write(f"{t:.9f} " + " ".join(f"{v:.9f}" for v in [*T[:3, 3], *q]) + "\n")
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM trajectory; '#' lines are comments; rows at or before the time of the last are dropped."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} not found")
+    try:
+        rows = np.loadtxt(path, comments="#", ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{path}: expected lines 't tx ty tz qx qy qz qw'; {error}") from error
+    if rows.size == 0 or rows.shape[1] != 8:
+        raise DataError(
+            f"{path}: expected 8 numbers a line (t tx ty tz qx qy qz qw), got {rows.shape}"
+        )
+    if not np.isfinite(rows).all():
+        raise DataError(f"{path}: holds values that are not finite; remove those lines")
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    if np.any(norms < 1e-6):
+        raise DataError(f"{path}: a quaternion is zero; expected unit quaternions qx qy qz qw")
+    keep = np.concatenate([[True], rows[1:, 0] > np.maximum.accumulate(rows[:-1, 0])])
+    rows = rows[keep]
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return Trajectory(rows[:, 0], poses)

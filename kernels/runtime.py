@@ -1,0 +1,69 @@
+"""Start Taichi, and check what crosses the torch / Taichi boundary."""
+
+import os
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+
+import numpy as np
+import taichi as ti
+import torch
+
+CHUNK = 512  # Taichi's CPU backend never splits a loop into pieces smaller than this
+
+
+def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool = False) -> None:
+    """Start Taichi on "cpu" or "cuda"; "f64" makes the same kernels run in double precision.
+
+    `threads` is the number of CPU workers. `debug` checks array bounds (slow). Calling it again
+    restarts Taichi. Raises RuntimeError when the device is not there: Taichi itself only warns.
+    """
+    if arch not in ("cpu", "cuda"):
+        raise ValueError(f"arch: expected 'cpu' or 'cuda', got {arch!r}")
+    if precision not in ("f32", "f64"):
+        raise ValueError(f"precision: expected 'f32' or 'f64', got {precision!r}")
+    if arch == "cuda" and not torch.cuda.is_available():
+        raise RuntimeError("cuda: torch finds no CUDA device (or is a CPU build); use --device cpu")
+    ti.init(
+        arch=ti.cuda if arch == "cuda" else ti.cpu,
+        default_fp=ti.f64 if precision == "f64" else ti.f32,
+        cpu_max_num_threads=threads,
+        fast_math=False,
+        offline_cache=True,
+        debug=debug,
+        log_level=ti.ERROR,
+    )
+    actual = ti.cfg.arch
+    if (actual == ti.cuda) != (arch == "cuda"):
+        raise RuntimeError(f"{arch}: Taichi started on {actual} instead; use --device cpu")
+
+
+def workers() -> int:
+    """Return the number of CPU workers Taichi was started with."""
+    return int(ti.cfg.cpu_max_num_threads)
+
+
+def float_dtype() -> torch.dtype:
+    """Return the torch dtype of the kernels' floats."""
+    return torch.float64 if ti.cfg.default_fp == ti.f64 else torch.float32
+
+
+def check_shape(
+    name: str, array: "torch.Tensor | np.ndarray", expected: tuple[int | None, ...]
+) -> None:
+    """Raise ValueError unless the array has the expected shape (None = any size)."""
+    shape = tuple(array.shape)
+    if len(shape) != len(expected) or any(
+        e is not None and e != s for s, e in zip(shape, expected)
+    ):
+        wanted = "(" + ", ".join("*" if e is None else str(e) for e in expected) + ")"
+        raise ValueError(f"{name}: expected shape {wanted}, got {shape}")
+
+
+def plain(name: str, tensor: torch.Tensor) -> torch.Tensor:
+    """Return the tensor detached, contiguous and in the kernels' float type, ready for a kernel.
+
+    A tensor that requires grad would get a `.grad` allocated behind our back.
+    """
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name}: expected a floating point tensor, got {tensor.dtype}")
+    return tensor.detach().to(float_dtype()).contiguous()
