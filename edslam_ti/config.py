@@ -127,9 +127,7 @@ def read_differences(path: Path) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text()) or {}
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{path}: not readable as YAML ({' '.join(str(error).split())})"
-        ) from error
+        raise ConfigError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping 'key: value', got {type(values).__name__}")
     Config._validated(merged(Config().model_dump(), values), source=str(path))
@@ -141,9 +139,7 @@ def merged(base: dict[str, Any], differences: dict[str, Any]) -> dict[str, Any]:
     result = dict(base)
     for key, value in differences.items():
         old = result.get(key)
-        result[key] = (
-            merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-        )
+        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return result
 
 

@@ -27,9 +27,7 @@ class Events:
     @staticmethod
     def empty() -> "Events":
         """Return a slice without events."""
-        return Events(
-            np.empty(0, np.int16), np.empty(0, np.int16), np.empty(0), np.empty(0, np.int8)
-        )
+        return Events(np.empty(0, np.int16), np.empty(0, np.int16), np.empty(0), np.empty(0, np.int8))
 
     def between(self, start: float, end: float) -> "Events":
         """Return the events with start <= t < end (views, not copies)."""
@@ -41,6 +39,4 @@ class Events:
         """Return consecutive slices as one."""
         if not parts:
             return Events.empty()
-        return Events(
-            *(np.concatenate([getattr(p, f) for p in parts]) for f in ("x", "y", "t", "polarity"))
-        )
+        return Events(*(np.concatenate([getattr(p, f) for p in parts]) for f in ("x", "y", "t", "polarity")))

@@ -27,9 +27,7 @@ def _exp_coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     t2 = theta_squared
     a = torch.where(small, 1 - t2 / 6 + t2 * t2 / 120, theta.sin() / theta)
     b = torch.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, (1 - theta.cos()) / safe)
-    c = torch.where(
-        small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (theta - theta.sin()) / (safe * theta)
-    )
+    c = torch.where(small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (theta - theta.sin()) / (safe * theta))
     return a, b, c
 
 
@@ -65,17 +63,13 @@ def se3_log(T: Tensor) -> Tensor:  # [..., 4, 4] -> [..., 6]
     a, _, _ = _exp_coefficients(theta2)
     near = theta2 < 1e-4
     safe2 = torch.where(near, torch.ones_like(theta2), theta2)
-    d = torch.where(
-        near, 1 / 12 + theta2 / 720 + theta2 * theta2 / 30240, (1 - a / (2 * b)) / safe2
-    )
+    d = torch.where(near, 1 / 12 + theta2 / 720 + theta2 * theta2 / 30240, (1 - a / (2 * b)) / safe2)
     eye = torch.eye(3, dtype=T.dtype, device=T.device)
     v = ((eye - 0.5 * W + d[..., None, None] * (W @ W)) @ t[..., None])[..., 0]
     return torch.cat([v, w], -1)
 
 
-def from_rotation_translation(
-    R: Tensor, t: Tensor
-) -> Tensor:  # [..., 3, 3], [..., 3] -> [..., 4, 4]
+def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:  # [..., 3, 3], [..., 3] -> [..., 4, 4]
     """Return the 4x4 matrix [R t; 0 1]."""
     top = torch.cat([R, t[..., None]], -1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device)

@@ -14,22 +14,16 @@ from edslam_ti.output import atomic_file
 class Trajectory:
     """Poses `T_world_camera` [F, 4, 4] at strictly increasing times [F] in seconds."""
 
-    def __init__(
-        self, timestamps: np.ndarray | None = None, poses: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, timestamps: np.ndarray | None = None, poses: np.ndarray | None = None) -> None:
         self._timestamps: list[float] = [] if timestamps is None else [float(t) for t in timestamps]
-        self._poses: list[np.ndarray] = (
-            [] if poses is None else [np.array(p, np.float64) for p in poses]
-        )
+        self._poses: list[np.ndarray] = [] if poses is None else [np.array(p, np.float64) for p in poses]
         if len(self._timestamps) != len(self._poses):
             raise DataError(
                 f"trajectory: expected one pose per time stamp, got {len(self._timestamps)} time "
                 f"stamps and {len(self._poses)} poses"
             )
         if np.any(np.diff(self._timestamps) <= 0):
-            raise DataError(
-                "trajectory: expected strictly increasing time stamps; sort or deduplicate them"
-            )
+            raise DataError("trajectory: expected strictly increasing time stamps; sort or deduplicate them")
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -107,9 +101,7 @@ def read_tum(path: Path) -> Trajectory:
     except ValueError as error:
         raise DataError(f"{path}: expected lines 't tx ty tz qx qy qz qw'; {error}") from error
     if rows.size == 0 or rows.shape[1] != 8:
-        raise DataError(
-            f"{path}: expected 8 numbers a line (t tx ty tz qx qy qz qw), got {rows.shape}"
-        )
+        raise DataError(f"{path}: expected 8 numbers a line (t tx ty tz qx qy qz qw), got {rows.shape}")
     if not np.isfinite(rows).all():
         raise DataError(f"{path}: holds values that are not finite; remove those lines")
     norms = np.linalg.norm(rows[:, 4:], axis=1)

@@ -47,14 +47,10 @@ def float_dtype() -> torch.dtype:
     return torch.float64 if ti.cfg.default_fp == ti.f64 else torch.float32
 
 
-def check_shape(
-    name: str, array: "torch.Tensor | np.ndarray", expected: tuple[int | None, ...]
-) -> None:
+def check_shape(name: str, array: "torch.Tensor | np.ndarray", expected: tuple[int | None, ...]) -> None:
     """Raise ValueError unless the array has the expected shape (None = any size)."""
     shape = tuple(array.shape)
-    if len(shape) != len(expected) or any(
-        e is not None and e != s for s, e in zip(shape, expected)
-    ):
+    if len(shape) != len(expected) or any(e is not None and e != s for s, e in zip(shape, expected)):
         wanted = "(" + ", ".join("*" if e is None else str(e) for e in expected) + ")"
         raise ValueError(f"{name}: expected shape {wanted}, got {shape}")
 

@@ -1,5 +1,6 @@
 """What every sequence offers, and how it is cut into samples."""
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -99,7 +100,7 @@ class SampledSequence:
                 f"events {first:.3f} to {last:.3f} s; change --start or --duration"
             )
         times, has_depth = [float(inside[0])], [True]
-        for a, b in zip(inside[:-1], inside[1:]):
+        for a, b in itertools.pairwise(inside):
             pieces = int(np.ceil((b - a) / max_interval - 1e-6))
             times += [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
             has_depth += [False] * (pieces - 1) + [True]
