@@ -31,6 +31,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
         offline_cache=True,
         debug=debug,
         log_level=ti.ERROR,
+        verbose=False,
     )
     actual = ti.cfg.arch
     if (actual == ti.cuda) != (arch == "cuda"):

@@ -1,0 +1,147 @@
+"""Plain torch twins of the kernels: the specification, written for reading, compared in tests.
+
+Everything here is differentiable by torch's autograd, which is the oracle for the hand-written
+backward passes.
+"""
+
+import torch
+from torch import Tensor
+
+from kernels.patch_warp import ResidualModel
+from kernels.projection import LOW_PASS, MIN_ALPHA, NEAR
+from kernels.rasterization import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE, Rasterization
+
+# --- time surface ---
+
+
+def last_timestamps(x: Tensor, y: Tensor, t: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the time of the newest event of every pixel, -inf where there is none."""
+    flat = torch.full((shape[0] * shape[1],), -torch.inf, dtype=torch.float64)
+    flat.scatter_reduce_(0, y.long() * shape[1] + x.long(), t.double(), "amax")
+    return flat.view(shape)
+
+
+def time_surface(last: Tensor, t: float, decay: float) -> Tensor:
+    """Eq. 1."""
+    return torch.exp(-(t - last) / decay).float()
+
+
+def accumulate_polarity(x: Tensor, y: Tensor, polarity: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Eq. 11 without the factor C: sum of polarities of every pixel."""
+    flat = torch.zeros(shape[0] * shape[1], dtype=torch.int16)
+    return flat.index_add_(0, y.long() * shape[1] + x.long(), polarity.to(torch.int16)).view(shape)
+
+
+# --- patches ---
+
+
+def warp_pixels(pixels: Tensor, T_b_a: Tensor, intrinsics: tuple[float, ...]) -> Tensor:
+    """Eq. 3: pixels [M, 3] (x, y, rho) of view a -> [M, 3] (x', y', z') in view b."""
+    fx, fy, cx, cy = intrinsics
+    z = 1 / pixels[:, 2]
+    p_a = torch.stack([(pixels[:, 0] - cx) / fx * z, (pixels[:, 1] - cy) / fy * z, z], -1)
+    p = p_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    return torch.stack([fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy, p[:, 2]], -1)
+
+
+def sample_bilinear(image: Tensor, points: Tensor) -> Tensor:
+    """Eq. 4: image [H, W] at points [M, >= 2] inside it."""
+    x, y = points[:, 0], points[:, 1]
+    j, i = x.detach().floor().long(), y.detach().floor().long()
+    fx, fy = x - j, y - i
+    top = image[i, j] * (1 - fx) + image[i, j + 1] * fx
+    bottom = image[i + 1, j] * (1 - fx) + image[i + 1, j + 1] * fx
+    return top * (1 - fy) + bottom * fy
+
+
+def alignment_residuals(
+    pixels: Tensor, values: Tensor, surface: Tensor, depth: Tensor, T_b_a: Tensor,
+    intrinsics: tuple[float, ...], model: ResidualModel,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Eq. 5, one direction: normalised surface residuals and (weighted) depth residuals."""
+    usable = pixels[:, 2] > 0
+    warped = warp_pixels(pixels[usable], T_b_a, intrinsics)
+    height, width = surface.shape
+    x, y, z = warped.unbind(-1)
+    inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1) & (z > NEAR)
+    warped, values = warped[inside], values[usable][inside]
+    j, i = warped[:, 0].detach().floor().long(), warped[:, 1].detach().floor().long()
+    corners = torch.stack([depth[i, j], depth[i, j + 1], depth[i + 1, j], depth[i + 1, j + 1]], -1)
+    has_depth = corners.amin(-1) > NEAR
+    r_depth = warped[:, 2] - sample_bilinear(depth, warped)
+    keep = ~has_depth | (r_depth.abs() < model.max_depth_difference)
+    r_surface = (sample_bilinear(surface, warped) - values)[keep] / model.surface_sigma
+    is_smooth = corners.amax(-1) - corners.amin(-1) < 0.05 * corners.amax(-1)
+    sigma = model.depth_sigma + model.depth_sigma_2 * warped[:, 2].detach() ** 2
+    return r_surface, (r_depth / sigma)[keep & has_depth & is_smooth]
+
+
+def huber(r: Tensor, threshold: float) -> Tensor:
+    """Return Huber's cost of each normalised residual."""
+    return torch.where(r.abs() <= threshold, 0.5 * r * r, threshold * (r.abs() - 0.5 * threshold))
+
+
+# --- Gaussians ---
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Quaternions [N, 4] wxyz of any norm -> rotation matrices [N, 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).view(-1, 3, 3)
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, intrinsics: tuple[float, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Eq. 6-7: 2D means [N, 2], 2D covariances [N, 2, 2] and depths [N]."""
+    fx, fy, cx, cy = intrinsics
+    R_c, t_c = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    x, y, z = (means @ R_c.T + t_c).unbind(-1)
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).view(-1, 2, 3)
+    A = J @ R_c @ rotation_matrices(quats) @ torch.diag_embed(scales)
+    covariances = A @ A.transpose(-1, -2) + LOW_PASS * torch.eye(2, dtype=means.dtype)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariances, z
+
+
+def rasterize(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor,
+    T_camera_world: Tensor, intrinsics: tuple[float, ...], size: tuple[int, int],
+) -> Rasterization:  # fmt: skip
+    """Eq. 8 for every pixel and Gaussian at once; see kernels.rasterization.rasterize."""
+    width, height = size
+    n = len(means)
+    R_c, t_c = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    front = torch.nonzero(((means @ R_c.T + t_c)[:, 2] > NEAR) & (opacities > MIN_ALPHA))[:, 0]
+    means_2d, covariances, depths = project(
+        means[front], quats[front], scales[front], T_camera_world, intrinsics
+    )
+    u, v = means_2d.detach().unbind(-1)
+    near_image = (u > -0.3 * width) & (u < 1.3 * width) & (v > -0.3 * height) & (v < 1.3 * height)
+    order = depths.detach().float().argsort(stable=True)
+    order = order[near_image[order]]
+    index = front[order]
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=means.dtype), torch.arange(width, dtype=means.dtype), indexing="ij"
+    )
+    delta = torch.stack([x, y], -1).view(-1, 1, 2) - means_2d[order]  # [H W, n, 2]
+    power = 0.5 * torch.einsum("pni,nij,pnj->pn", delta, torch.linalg.inv(covariances[order]), delta)
+    alpha = opacities[index] * torch.exp(-power)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp_max(MAX_ALPHA), torch.zeros_like(alpha))
+    before = torch.cat([torch.ones_like(alpha[:, :1]), torch.cumprod(1 - alpha, 1)[:, :-1]], 1)
+    alpha = torch.where(before > MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
+    T = torch.cat([torch.ones_like(alpha[:, :1]), torch.cumprod(1 - alpha, 1)], 1)  # [H W, n + 1]
+    weights = alpha * T[:, :-1]
+    visible = torch.zeros(n, dtype=torch.bool)
+    visible[index] = ((alpha > 0) & (T[:, :-1] > VISIBLE_TRANSMITTANCE)).any(0)
+    return Rasterization(
+        (weights @ colors[index]).view(height, width, -1),
+        (weights @ depths[order]).view(height, width),
+        (1 - T[:, -1]).view(height, width),
+        visible,
+    )

@@ -1,0 +1,127 @@
+"""Patches, warp, sampling and normal equations (Eq. 2-5)."""
+
+import numpy as np
+import pytest
+import torch
+
+from edslam_ti.geometry import inverse, se3_exp
+from kernels import reference
+from kernels.patch_warp import (
+    ResidualModel,
+    extract_patches,
+    normal_equations,
+    sample_bilinear,
+    warp_pixels,
+)
+
+INTRINSICS = (50.0, 48.0, 31.5, 23.5)
+SHAPE = (48, 64)
+MODEL = ResidualModel()
+
+
+def make_view(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth surface and a smooth depth with a hole."""
+    v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float64)
+    phase = seed * 0.7
+    surface = 0.5 + 0.25 * np.sin(u / 4 + phase) + 0.2 * np.cos(v / 3 - u / 9)
+    depth = 2 + 0.3 * np.sin(u / 15) + 0.2 * np.cos(v / 11)
+    depth[5:9, 40:50] = 0
+    return surface.astype(np.float32), depth.astype(np.float32)
+
+
+def make_centres(n: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.integers(0, SHAPE[1], n), rng.integers(0, SHAPE[0], n)], -1).astype(np.int32)
+
+
+def make_motion(size: float, seed: int = 0) -> np.ndarray:
+    return se3_exp(
+        size * torch.randn(6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    ).numpy()
+
+
+def test_identity_warp_returns_the_patch() -> None:
+    surface, depth = make_view(0)
+    patches = extract_patches(surface, depth, make_centres(20, 1), 5)
+    warped = warp_pixels(patches.pixels, np.eye(4), INTRINSICS)
+    usable = patches.pixels[:, 2] > 0
+    assert np.allclose(warped[usable, :2], patches.pixels[usable, :2], atol=1e-4)
+    values, inside = sample_bilinear(surface, warped)
+    interior = usable & inside
+    assert np.allclose(values[interior], patches.values[interior], atol=1e-4)
+
+
+def test_patch_outside_the_image_is_invalid() -> None:
+    surface, depth = make_view(0)
+    patches = extract_patches(surface, depth, np.array([[-20, 10]], np.int32), 5)
+    assert not patches.pixels[:, 2].any()
+    result = normal_equations(patches, surface, depth, np.eye(4), INTRINSICS, MODEL)
+    assert result.num_usable == 0
+    assert result.cost == 0
+
+
+def test_warp_and_sampling_match_the_twin() -> None:
+    surface, depth = make_view(0)
+    patches = extract_patches(surface, depth, make_centres(30, 2), 5)
+    usable = patches.pixels[:, 2] > 0
+    T = make_motion(0.03)
+    warped = warp_pixels(patches.pixels, T, INTRINSICS)
+    twin = reference.warp_pixels(
+        torch.from_numpy(patches.pixels[usable]).double(), torch.from_numpy(T), INTRINSICS
+    )
+    assert np.allclose(warped[usable], twin.numpy(), atol=1e-4)
+    values, inside = sample_bilinear(surface, warped)
+    good = usable & inside
+    expected = reference.sample_bilinear(torch.from_numpy(surface), torch.from_numpy(warped[good]))
+    assert np.allclose(values[good], expected.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("is_inverse", [False, True])
+def test_normal_equations_match_autograd_of_the_twin(is_inverse: bool) -> None:
+    surface_a, depth_a = make_view(0)
+    surface_b, depth_b = make_view(1)
+    patches = extract_patches(surface_a, depth_a, make_centres(40, 3), 5)
+    T = torch.from_numpy(make_motion(0.02, seed=4))  # the transform whose update is sought
+    ours = normal_equations(
+        patches, surface_b, depth_b, (inverse(T) if is_inverse else T).numpy(), INTRINSICS, MODEL, is_inverse
+    )
+
+    def residuals(xi: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        updated = se3_exp(xi) @ T
+        T_b_a = inverse(updated) if is_inverse else updated
+        arrays = [torch.from_numpy(x).double() for x in (patches.pixels, patches.values, surface_b, depth_b)]
+        return reference.alignment_residuals(*arrays, T_b_a, INTRINSICS, MODEL)
+
+    zero = torch.zeros(6, dtype=torch.float64)
+    r = residuals(zero)
+    jacobians = torch.autograd.functional.jacobian(residuals, zero)
+    H, g, cost = torch.zeros(6, 6).double(), torch.zeros(6).double(), 0.0
+    for r_k, J, weight in zip(r, jacobians, (1.0, MODEL.depth_weight)):
+        w = weight * torch.clamp(MODEL.huber_threshold / r_k.abs().clamp_min(1e-12), max=1.0)
+        H += J.T @ (w[:, None] * J)
+        g += J.T @ (w * r_k)
+        cost += weight * float(reference.huber(r_k, MODEL.huber_threshold).sum())
+    assert (ours.num_surface, ours.num_depth) == (len(r[0]), len(r[1]))
+    # float32 residuals at depth sigma of millimetres against float64
+    assert ours.cost == pytest.approx(cost, rel=1e-3)
+    assert np.linalg.norm(ours.H - H.numpy()) / np.linalg.norm(H) < 1e-3
+    assert np.linalg.norm(ours.g - g.numpy()) / np.linalg.norm(g) < 5e-3
+
+
+def test_depth_that_disagrees_by_more_than_tau_d_is_discarded() -> None:
+    surface, depth = make_view(0)
+    patches = extract_patches(surface, depth, make_centres(40, 5), 5)
+    far = np.where(depth > 0, depth + 0.2, 0).astype(np.float32)
+    agreeing = normal_equations(patches, surface, depth, np.eye(4), INTRINSICS, MODEL)
+    disagreeing = normal_equations(patches, surface, far, np.eye(4), INTRINSICS, MODEL)
+    assert agreeing.num_depth > 300
+    assert disagreeing.num_depth == 0
+    assert disagreeing.num_surface < 0.1 * agreeing.num_surface  # only those without depth to check
+
+
+def test_missing_depth_in_the_other_view_keeps_the_surface_residual() -> None:
+    surface, depth = make_view(0)
+    patches = extract_patches(surface, depth, make_centres(40, 6), 5)
+    result = normal_equations(patches, surface, np.zeros_like(depth), np.eye(4), INTRINSICS, MODEL)
+    assert result.num_depth == 0
+    assert result.num_surface > 300

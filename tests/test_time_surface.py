@@ -1,0 +1,63 @@
+"""Time surface and accumulated polarity (Eq. 1, Eq. 11)."""
+
+import numpy as np
+import pytest
+import torch
+
+from kernels import reference
+from kernels.time_surface import accumulate_polarity, time_surface, update_last_timestamps
+
+SHAPE = (12, 16)
+
+
+def make_events(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    x = rng.integers(0, SHAPE[1], n).astype(np.int16)
+    y = rng.integers(0, SHAPE[0], n).astype(np.int16)
+    return x, y, np.sort(rng.uniform(0, 1, n)), rng.choice([-1, 1], n).astype(np.int8)
+
+
+def test_surface_matches_the_twin_over_several_batches() -> None:
+    x, y, t, _ = make_events(500, 0)
+    last = np.full(SHAPE, -np.inf)
+    for part in np.array_split(np.arange(500), 3):
+        update_last_timestamps(x[part], y[part], t[part], last)
+    expected = reference.last_timestamps(*map(torch.from_numpy, (x, y, t)), SHAPE)
+    assert np.array_equal(last, expected.numpy())
+    ours = time_surface(last, 1.0, 0.03)
+    assert np.allclose(ours, reference.time_surface(expected, 1.0, 0.03).numpy(), atol=1e-6)
+
+
+def test_surface_is_one_at_a_fresh_event_and_zero_without_events() -> None:
+    last = np.full(SHAPE, -np.inf)
+    update_last_timestamps(np.array([3], np.int16), np.array([5], np.int16), np.array([0.5]), last)
+    surface = time_surface(last, 0.5, 0.02)
+    assert surface[5, 3] == 1
+    assert surface.sum() == 1
+    assert time_surface(last, 0.52, 0.02)[5, 3] == pytest.approx(np.exp(-1), abs=1e-6)
+
+
+def test_microseconds_survive_at_late_times() -> None:
+    last = np.full(SHAPE, -np.inf)
+    update_last_timestamps(np.array([0], np.int16), np.array([0], np.int16), np.array([3600.0]), last)
+    ratio = -np.log(time_surface(last, 3600.000001, 1e-5)[0, 0]) * 1e-5
+    assert ratio == pytest.approx(1e-6, rel=1e-3)
+
+
+def test_polarity_sums_match_the_twin_in_every_interval() -> None:
+    x, y, t, polarity = make_events(2000, 1)
+    first = np.searchsorted(t, [0.0, 0.2, 0.2, 0.7, 1.1])
+    ours = accumulate_polarity(x, y, polarity, first, SHAPE)
+    for b in range(4):
+        part = slice(first[b], first[b + 1])
+        twin = reference.accumulate_polarity(
+            *map(torch.from_numpy, (x[part], y[part], polarity[part])), SHAPE
+        )
+        assert np.array_equal(ours[b], twin.numpy())
+    assert ours[1].any() == False  # noqa: E712  (an empty interval)
+
+
+def test_events_outside_the_image_are_refused() -> None:
+    last = np.full(SHAPE, -np.inf)
+    with pytest.raises(ValueError, match="0 <= x < 16"):
+        update_last_timestamps(np.array([16], np.int16), np.array([0], np.int16), np.array([0.0]), last)
