@@ -1,0 +1,82 @@
+"""Depth images to points, and the spacing of points that gives Gaussians their first scales (Open3D)."""
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError
+from edslam_ti.open3d_loader import load_open3d
+
+FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
+SMALLEST_SCALE = 1e-4  # metres; points that coincide would give a scale of zero, whose logarithm is -inf
+
+
+def depth_to_points(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+    camera: Camera,
+    T_world_camera: np.ndarray,  # [4, 4]
+    mask: np.ndarray | None = None,  # [H, W] bool, pixels to use; None = all
+) -> tuple[np.ndarray, np.ndarray]:  # [N, 3] float32 metres, world; [N, 2] int64 (x, y)
+    """Return the world points of the pixels with depth, row by row, and those pixels.
+
+    The legacy point cloud keeps the order of the pixels; Open3D's tensor one does not.
+    """
+    _check_image("depth", depth, camera)
+    # Comparisons with NaN are false: such pixels count as missing.
+    used = (depth > 0) & (depth < FARTHEST)
+    if mask is not None:
+        _check_image("mask", mask, camera)
+        used &= mask
+    o3d = load_open3d()
+    cloud = o3d.geometry.PointCloud.create_from_depth_image(
+        o3d.geometry.Image(np.ascontiguousarray(np.where(used, depth, 0), np.float32)),
+        o3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *camera.intrinsics),
+        np.linalg.inv(T_world_camera),
+        depth_scale=1.0,
+        depth_trunc=2 * FARTHEST,
+    )
+    points = np.asarray(cloud.points, dtype=np.float32).reshape(-1, 3)
+    y, x = np.nonzero(used)
+    return points, np.stack([x, y], -1)
+
+
+def nearest_neighbour_scales(
+    points: np.ndarray,  # [N, 3] metres, N >= 2
+    max_neighbours: int = 3,
+) -> np.ndarray:  # [N] float32 metres
+    """Return the mean distance of each point to its nearest others (Kerbl et al. 2023, Sec. 5.1)."""
+    if len(points) < 2:
+        raise DataError(
+            f"points: expected at least 2 to measure their spacing, got {len(points)}; "
+            "use the size of a pixel at that depth instead"
+        )
+    o3d = load_open3d()
+    search = o3d.core.nns.NearestNeighborSearch(
+        o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
+    )
+    search.knn_index()
+    count = min(max_neighbours + 1, len(points))  # the nearest is the point itself
+    _, squared = search.knn_search(
+        o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)), count
+    )  # [N, count]
+    distances = np.sqrt(np.maximum(squared.numpy()[:, 1:], 0))
+    return np.maximum(distances.mean(1), SMALLEST_SCALE)
+
+
+def surface_normals(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+    camera: Camera,
+) -> np.ndarray:  # [H, W, 3] float32 unit vectors, camera frame
+    """Return the normal at every pixel, towards the camera; zero where a neighbour's depth is missing."""
+    _check_image("depth", depth, camera)
+    o3d = load_open3d()
+    valid = (depth > 0) & (depth < FARTHEST)
+    image = o3d.t.geometry.Image(np.ascontiguousarray(np.where(valid, depth, 0), np.float32))
+    vertices = image.create_vertex_map(o3d.core.Tensor(camera.matrix), 0.0)  # [H, W, 3]
+    normals = vertices.create_normal_map(0.0).as_tensor().numpy().copy()
+    facing_away = (normals * vertices.as_tensor().numpy()).sum(-1, keepdims=True) > 0
+    return np.where(facing_away, -normals, normals)
+
+
+def _check_image(name: str, image: np.ndarray, camera: Camera) -> None:
+    if image.shape != camera.shape:
+        raise DataError(f"{name}: expected shape {camera.shape} as the camera's, got {image.shape}")
