@@ -40,11 +40,35 @@ class TrackingConfig(Stage):
     """Patch centres are drawn where the surface exceeds this (tau in Sec. III-B; not given there)."""
     max_depth_difference: float = Field(0.1, gt=0)
     """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
+    references: Literal["previous", "keyframe", "both"] = "both"
+    """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
+    surface_sigma: float = Field(0.15, gt=0)
+    """Standard deviation of a time-surface residual."""
+    depth_weight: float = Field(0.3, ge=0)
+    """Weight of the depth residual beside the time surface; 0: Eq. 5 alone."""
+    depth_sigma: float = Field(0.003, gt=0)
+    """Standard deviation of depth at short range, metres."""
+    depth_sigma_2: float = Field(0.0019, ge=0)
+    """Growth of the depth's standard deviation with depth squared, 1/m (Kinect: 0.0019)."""
+    huber_threshold: float = Field(1.345, gt=0)
+    """Residuals beyond this many standard deviations count linearly (Eq. 5 sums unsquared norms)."""
+    levels: int = Field(3, ge=1, le=6)
+    """Pyramid levels, coarse to fine."""
+    iterations: int = Field(20, ge=1)
+    """At most this many Levenberg-Marquardt steps a level."""
+    min_overlap: float = Field(0.7, gt=0, lt=1)
+    """Below this fraction of patch pixels seen, the frame becomes the tracker's next keyframe."""
+    min_inliers: float = Field(0.3, gt=0, lt=1)
+    """Below this fraction of patch pixels in agreement, tracking has failed."""
 
 
 class KeyframeConfig(Stage):
     """When an event chunk becomes a keyframe, and what it keeps (Sec. III-E)."""
 
+    min_covisibility: float = Field(0.85, gt=0, lt=1)
+    """A frame sharing a smaller fraction of visible Gaussians with the last keyframe becomes one."""
+    max_translation: float = Field(0.05, gt=0)
+    """Also beyond this translation relative to the median depth (MonoGS: 0.02 to 0.04)."""
     num_chunks: int = Field(5, ge=1)
     """N: event chunks stored with a keyframe."""
 
@@ -54,6 +78,57 @@ class MappingConfig(Stage):
 
     enabled: bool = True
     """False: track only, build no map."""
+    iterations: int = Field(20, ge=0)
+    """Optimisation steps after each frame."""
+    initial_iterations: int = Field(100, ge=0)
+    """Steps after the first keyframe has seen some motion."""
+    final_iterations: int = Field(400, ge=0)
+    """Steps over all keyframes after the last frame."""
+    pixel_stride: int = Field(2, ge=1)
+    """One new Gaussian for every stride x stride pixels that need one."""
+    min_visibility: float = Field(0.8, gt=0, lt=1)
+    """lambda_V of Eq. 13: pixels with less alpha get new Gaussians (Sec. IV-A)."""
+    depth_error_factor: float = Field(50.0, gt=0)
+    """lambda_MDE of Eq. 13: so many median depth errors also ask for new Gaussians (Sec. IV-A)."""
+    max_gaussians: int = Field(200_000, ge=1)
+    """No Gaussians are added beyond this."""
+    initial_opacity: float = Field(0.9, gt=0, lt=1)
+    """Opacity of a new Gaussian."""
+    min_opacity: float = Field(0.05, ge=0, lt=1)
+    """Gaussians that have become fainter are pruned."""
+    intervals: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+    """Lengths of the event intervals of Eq. 10-11 in seconds, drawn at random: short ones give detail,
+    long ones tie the brightness of distant surfaces together."""
+    bins_per_chunk: int = Field(5, ge=1)
+    """Times within a chunk at which an interval may begin or end."""
+    event_weight: float = Field(1.0, ge=0)
+    """lambda_event of Eq. 16; our event loss is divided by its mean measured square (paper: 0.7)."""
+    depth_weight: float = Field(1.0, ge=0)
+    """lambda_d of Eq. 16 (paper: 0.05)."""
+    depth_every: int = Field(4, ge=1)
+    """The depth loss (Eq. 15) is added at every n-th step."""
+    scale_weight: float = Field(0.01, ge=0)
+    """lambda_reg of Eq. 16 (paper: 0.25)."""
+    max_scale_ratio: float = Field(10.0, ge=1)
+    """r of Eq. 14: Gaussians may be this much longer than thick."""
+    log_epsilon: float = Field(0.01, gt=0)
+    """Added to brightness before the logarithm of Eq. 10."""
+    background: float = Field(0.5, gt=0, lt=1)
+    """Brightness where nothing is drawn; also of new Gaussians without neighbours."""
+    means_rate: float = Field(2e-4, gt=0)
+    """Adam's learning rate of the means, metres."""
+    quats_rate: float = Field(1e-3, gt=0)
+    """Adam's learning rate of the quaternions (gsplat)."""
+    scales_rate: float = Field(5e-3, gt=0)
+    """Adam's learning rate of the log-scales (gsplat)."""
+    opacities_rate: float = Field(2e-2, gt=0)
+    """Adam's learning rate of the opacity logits."""
+    colors_rate: float = Field(3e-2, gt=0)
+    """Adam's learning rate of the brightness logits."""
+    bundle_adjustment: bool = True
+    """Optimise the frames' poses together with the map."""
+    poses_rate: float = Field(1e-4, gt=0)
+    """Adam's learning rate of poses, metres and radians."""
 
 
 class EvaluationConfig(Stage):

@@ -36,6 +36,10 @@ class Trajectory:
     def poses(self) -> np.ndarray:  # [F, 4, 4]
         return np.array(self._poses).reshape(-1, 4, 4)
 
+    def pose(self, index: int) -> np.ndarray:  # [4, 4]
+        """Return key pose `index`; negative counts from the end."""
+        return self._poses[index]
+
     def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
         """Add a pose later than all others."""
         if self._timestamps and timestamp <= self._timestamps[-1]:
@@ -68,10 +72,6 @@ class Trajectory:
             (timestamp - start) / (end - start),
         )
         return pose.numpy()
-
-    def predict(self, timestamp: float) -> np.ndarray:  # [4, 4]
-        """Return the pose expected at a later time under constant velocity."""
-        return self.at(timestamp)
 
     def resampled(self, timestamps: np.ndarray) -> "Trajectory":
         """Return the path at other times (strictly increasing)."""

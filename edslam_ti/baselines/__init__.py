@@ -1,0 +1,55 @@
+"""Methods by name. A method is a pair of a Tracker and a Mapper put into the same `Slam`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # a method's parts load Taichi or Open3D, which `--help` need not wait for
+    from edslam_ti.config import Config
+    from edslam_ti.datasets import EventDepthSequence
+    from edslam_ti.mapping import Mapper
+    from edslam_ti.tracking import Tracker
+
+    Build = Callable[[EventDepthSequence, float, Config], tuple[Tracker, Mapper]]
+
+
+@dataclass(frozen=True)
+class Method:
+    """How to make a method's two parts, and how its settings differ from the defaults."""
+
+    description: str
+    build: "Build"  # (sequence, contrast threshold, settings) -> tracker and mapper
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _ed_slam(
+    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.mapping import GaussianMapper
+    from edslam_ti.tracking import BidirectionalPatchTracker
+
+    tracker = BidirectionalPatchTracker(config.tracking, config.seed)
+    return tracker, GaussianMapper(sequence.camera, contrast_threshold, config)
+
+
+def _open3d_rgbd(
+    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.open3d_rgbd import RgbdOdometryTracker, TsdfMapper
+
+    return RgbdOdometryTracker(sequence.camera), TsdfMapper(sequence.camera)
+
+
+METHODS: dict[str, Method] = {
+    "ed_slam": Method(
+        "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
+    ),
+    "ed_slam_paper": Method(
+        "Eq. 5 to the letter: time surfaces alone, consecutive frames, both directions",
+        _ed_slam,
+        {"tracking": {"references": "previous", "depth_weight": 0.0}},
+    ),
+    "open3d_rgbd": Method(
+        "Open3D's RGB-D odometry and TSDF volume; needs images, uses no events", _open3d_rgbd
+    ),
+}

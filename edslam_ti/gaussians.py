@@ -1,0 +1,129 @@
+"""The Gaussian map (Sec. III-C): parameters, activations, and an Adam optimiser that grows with it."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from edslam_ti.config import MappingConfig
+
+# Raw parameters and their widths; the names carry the parametrisation.
+PARAMETERS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 0, "logit_colors": 1}
+
+
+class GaussianMap:
+    """N Gaussians as raw (unbounded) parameters: means [N, 3] in metres (world), quats [N, 4] wxyz,
+    log_scales [N, 3], logit_opacities [N], logit_colors [N, 1] (brightness in (0, 1) behind a sigmoid).
+    """
+
+    def __init__(self, config: MappingConfig) -> None:
+        empty = {name: torch.empty((0, width) if width else (0,)) for name, width in PARAMETERS.items()}
+        self._rates = {
+            "means": config.means_rate,
+            "quats": config.quats_rate,
+            "log_scales": config.scales_rate,
+            "logit_opacities": config.opacities_rate,
+            "logit_colors": config.colors_rate,
+        }
+        self._raw: dict[str, Tensor] = {}
+        self._adam = torch.optim.Adam([torch.empty(0)])
+        self._replace(empty, moments=None)
+
+    def __len__(self) -> int:
+        return len(self._raw["means"])
+
+    @property
+    def raw(self) -> Mapping[str, Tensor]:
+        """Raw parameters by name."""
+        return self._raw
+
+    @property
+    def means(self) -> Tensor:  # [N, 3] metres
+        return self._raw["means"]
+
+    @property
+    def quats(self) -> Tensor:  # [N, 4] wxyz, any norm
+        return self._raw["quats"]
+
+    @property
+    def scales(self) -> Tensor:  # [N, 3] metres
+        return self._raw["log_scales"].exp()
+
+    @property
+    def opacities(self) -> Tensor:  # [N] in (0, 1)
+        return self._raw["logit_opacities"].sigmoid()
+
+    @property
+    def colors(self) -> Tensor:  # [N, 1] brightness in (0, 1)
+        return self._raw["logit_colors"].sigmoid()
+
+    def add(
+        self,
+        means: Tensor,  # [M, 3] metres
+        scales: Tensor,  # [M, 3] metres
+        opacity: float,
+        colors: Tensor,  # [M, 1] in (0, 1)
+    ) -> None:
+        """Append Gaussians; their optimiser moments start at zero."""
+        m = len(means)
+        new = {
+            "means": means,
+            "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(m, 1),
+            "log_scales": scales.log(),
+            "logit_opacities": torch.full((m,), opacity).logit(),
+            "logit_colors": colors.clamp(0.02, 0.98).logit(),
+        }
+        moments = {
+            name: {key: torch.cat([value, torch.zeros_like(new[name])]) for key, value in state.items()}
+            for name, state in self._moments().items()
+        }
+        joined = {name: torch.cat([self._raw[name].detach(), new[name]]) for name in PARAMETERS}
+        self._replace(joined, moments)
+
+    def keep(self, mask: Tensor) -> None:
+        """Keep the Gaussians where mask [N] is true."""
+        moments = {
+            name: {key: value[mask] for key, value in state.items()}
+            for name, state in self._moments().items()
+        }
+        self._replace({name: value.detach()[mask] for name, value in self._raw.items()}, moments)
+
+    def step(self) -> None:
+        """Take one Adam step along the gradients, and clear them."""
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+        self._steps += 1
+
+    def decay_rates(self, factor: float) -> None:
+        """Set every learning rate to `factor` times its configured value."""
+        for group in self._adam.param_groups:
+            group["lr"] = self._rates[group["name"]] * factor
+
+    def _moments(self) -> dict[str, dict[str, Tensor]]:
+        """Return Adam's first and second moments by parameter; zeros before the first step."""
+        moments = {}
+        for name, value in self._raw.items():
+            state = self._adam.state.get(value, {})
+            moments[name] = {
+                key: state.get(key, torch.zeros_like(value)).detach() for key in ("exp_avg", "exp_avg_sq")
+            }
+        return moments
+
+    def _replace(self, values: dict[str, Tensor], moments: dict[str, dict[str, Tensor]] | None) -> None:
+        self._raw = {name: value.contiguous().requires_grad_() for name, value in values.items()}
+        factors = {
+            g["name"]: g["lr"] / self._rates[g["name"]] for g in self._adam.param_groups if "name" in g
+        }
+        self._adam = torch.optim.Adam(
+            [
+                {"params": [value], "lr": self._rates[name] * factors.get(name, 1.0), "name": name}
+                for name, value in self._raw.items()
+            ],
+            eps=1e-15,
+        )
+        if moments is None:
+            self._steps = 0
+            return
+        if self._steps:
+            for name, value in self._raw.items():
+                self._adam.state[value] = {"step": torch.tensor(float(self._steps)), **moments[name]}

@@ -1,0 +1,69 @@
+"""Views of a Gaussian map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edslam_ti.camera import Camera
+from edslam_ti.gaussians import GaussianMap
+from edslam_ti.geometry import inverse
+from kernels.rasterization import rasterize
+
+MIN_ALPHA = 1e-3  # below this there is no depth to speak of
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """A rendered view, differentiable in the map and the pose."""
+
+    intensity: Tensor  # [H, W] brightness, background included
+    depth: Tensor  # [H, W] metres, weighted by alpha (Eq. 8)
+    alpha: Tensor  # [H, W]
+    visible: Tensor  # [N] bool, Sec. III-E
+
+    @property
+    def expected_depth(self) -> Tensor:
+        """Depth of what is drawn: Eq. 8's sum divided by alpha, 0 where nothing is drawn."""
+        depth = self.depth / self.alpha.clamp_min(MIN_ALPHA)
+        return torch.where(self.alpha > MIN_ALPHA, depth, torch.zeros_like(depth))
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered view as plain arrays: what every method's mapper can show."""
+
+    intensity: np.ndarray  # [H, W] float32 brightness
+    depth: np.ndarray  # [H, W] float32 metres, 0 = nothing drawn
+    alpha: np.ndarray  # [H, W] float32
+
+
+def render(
+    gaussians: GaussianMap,
+    camera: Camera,
+    T_world_camera: Tensor,  # [4, 4]
+    background: float,  # brightness behind everything
+) -> RenderOutput:
+    """Return the map seen from a pose (Eq. 6-8)."""
+    drawn = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+        inverse(T_world_camera).float(),
+        camera.intrinsics,
+        (camera.width, camera.height),
+    )
+    intensity = drawn.image[..., 0] + (1 - drawn.alpha) * background
+    return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible)
+
+
+@torch.no_grad()
+def render_view(
+    gaussians: GaussianMap, camera: Camera, T_world_camera: np.ndarray, background: float
+) -> View:
+    """Return a view as arrays, with expected depth."""
+    output = render(gaussians, camera, torch.from_numpy(T_world_camera), background)
+    return View(output.intensity.numpy(), output.expected_depth.numpy(), output.alpha.numpy())

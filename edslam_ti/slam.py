@@ -1,0 +1,43 @@
+"""ED-SLAM as in Fig. 1 of the paper: events and depth in, trajectory and map out."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.datasets.base import Sample
+from edslam_ti.frame import FrameBuilder
+from edslam_ti.mapping import Mapper
+from edslam_ti.tracking import Tracker, TrackingResult
+from edslam_ti.trajectory import Trajectory
+
+
+@dataclass
+class Slam:
+    """A tracker and a mapper over one trajectory; any pair of them is a method."""
+
+    frame_builder: FrameBuilder
+    tracker: Tracker
+    mapper: Mapper | None  # None: tracking only
+    initial_pose: np.ndarray  # [4, 4] T_world_camera of the first frame
+
+    def __post_init__(self) -> None:
+        self.trajectory = Trajectory()
+        self.results: list[TrackingResult] = []
+        self.tracking_seconds = 0.0
+        self.mapping_seconds = 0.0
+
+    def process(self, sample: Sample, is_held_out: bool = False) -> TrackingResult:
+        """Track one sample and map it; a held-out one is tracked, but its depth is not mapped."""
+        started = time.perf_counter()
+        frame = self.frame_builder.build(sample, is_held_out)  # Eq. 1
+        guess = self.trajectory.at(frame.timestamp) if len(self.trajectory) else self.initial_pose
+        result = self.tracker.track(frame, guess, self.trajectory)  # Eq. 2-5
+        self.trajectory.append(frame.timestamp, result.T_world_camera)
+        self.results.append(result)
+        tracked = time.perf_counter()
+        if self.mapper is not None:
+            self.mapper.update(frame, self.trajectory)  # Eq. 6-16
+        self.tracking_seconds += tracked - started
+        self.mapping_seconds += time.perf_counter() - tracked
+        return result

@@ -1,0 +1,239 @@
+"""Bidirectional patch alignment of time surfaces and depth (Sec. III-B, Eq. 2-5)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from edslam_ti.config import TrackingConfig
+from edslam_ti.frame import Frame
+from edslam_ti.geometry import orthonormalized, se3_exp
+from edslam_ti.trajectory import Trajectory
+from kernels.patch_warp import NormalEquations, Patches, ResidualModel, extract_patches, normal_equations
+
+MIN_PIXELS = 200  # fewer residuals than this constrain no pose
+MAX_CONDITION = 1e7  # of the normal equations: beyond, some motion is not observed
+SMALL_STEP = 1e-6  # metres and radians: converged
+
+
+@dataclass(frozen=True)
+class TrackingResult:
+    """A pose and how far it can be trusted. A failure is a result, not an exception."""
+
+    T_world_camera: np.ndarray  # [4, 4]
+    converged: bool
+    quality: float  # fraction of patch pixels in agreement, 0 to 1
+    message: str = ""  # why it failed
+
+
+class Tracker(Protocol):
+    """Finds the pose of a frame; the first frame gets the pose it is expected at."""
+
+    def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+        """Return the pose of `frame`, expected near `guess` [4, 4]; `trajectory` holds those before it."""
+
+
+class TruePoses:
+    """A tracker that knows: `--poses truth`, for mapping alone."""
+
+    def __init__(self, true_pose: Callable[[float], np.ndarray | None]) -> None:
+        self._true_pose = true_pose
+
+    def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+        """Return the true pose."""
+        pose = self._true_pose(frame.timestamp)
+        if pose is None:
+            return TrackingResult(guess, False, 0.0, "no true pose at this time")
+        return TrackingResult(pose, True, 1.0)
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """A frame to align to, with its patches at every pyramid level."""
+
+    frame: Frame
+    patches: list[Patches]
+
+
+@dataclass(frozen=True)
+class _Alignment:
+    T_world_camera: np.ndarray
+    system: NormalEquations  # at the finest level
+
+
+class BidirectionalPatchTracker:
+    """Aligns each frame to its references by Levenberg-Marquardt on SE(3), coarse to fine."""
+
+    def __init__(self, config: TrackingConfig, seed: int) -> None:
+        self._config = config
+        self._random = np.random.default_rng(seed)
+        self._keyframe: _Reference | None = None
+        self._previous: _Reference | None = None
+        self._model = ResidualModel(
+            max_depth_difference=config.max_depth_difference,
+            surface_sigma=config.surface_sigma,
+            depth_weight=config.depth_weight,
+            depth_sigma=config.depth_sigma,
+            depth_sigma_2=config.depth_sigma_2,
+            huber_threshold=config.huber_threshold,
+        )
+
+    def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+        """Return the pose of `frame` relative to the references' poses on the trajectory."""
+        current = _Reference(frame, self._draw_patches(frame))
+        if self._keyframe is None:
+            if frame.depth is not None:
+                self._keyframe = self._previous = current
+            return TrackingResult(guess, True, 1.0)
+        result, overlap = self._track(current, guess, trajectory)
+        if frame.depth is not None:
+            if overlap < self._config.min_overlap or not result.converged:
+                self._keyframe = current
+            self._previous = current
+        return result
+
+    def _track(
+        self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory
+    ) -> tuple[TrackingResult, float]:
+        last = trajectory.poses[-1]
+        best: tuple[TrackingResult, float] | None = None
+        for guess in (predicted, last):  # constant velocity, then a sudden stop
+            alignment = self._align(current, guess, trajectory)
+            candidate = self._judge(alignment, predicted)
+            if best is None or candidate[0].quality > best[0].quality:
+                best = candidate
+            if best[0].converged:
+                break
+        assert best is not None
+        return best
+
+    def _judge(self, alignment: _Alignment, predicted: np.ndarray) -> tuple[TrackingResult, float]:
+        """Return the result and the overlap; a failed alignment falls back to the predicted pose."""
+        system = alignment.system
+        usable = max(system.num_usable, 1)
+        overlap = system.num_surface / usable
+        quality = max(0.0, 1.0 - system.cost / (system.num_surface * (1 + self._model.depth_weight) + 1) / 4)
+        quality *= min(1.0, overlap)
+        eigenvalues = np.linalg.eigvalsh(system.H)
+        message = ""
+        if system.num_surface < MIN_PIXELS:
+            message = f"only {system.num_surface} patch pixels visible"
+        elif overlap < self._config.min_inliers:
+            message = f"only {overlap:.0%} of patch pixels agree in depth"
+        elif eigenvalues[0] <= eigenvalues[-1] / MAX_CONDITION:
+            message = "motion not fully observed (ill-conditioned)"
+        if message:
+            return TrackingResult(predicted, False, quality, message), overlap
+        return TrackingResult(alignment.T_world_camera, True, quality), overlap
+
+    def _align(self, current: _Reference, guess: np.ndarray, trajectory: Trajectory) -> _Alignment:
+        T = guess
+        references = [(r, trajectory.at(r.frame.timestamp)) for r in self._references()]
+        for level in reversed(range(self._config.levels)):
+            T, system = self._levenberg_marquardt(current, references, T, level)
+        return _Alignment(orthonormalized(T), system)
+
+    def _references(self) -> list[_Reference]:
+        assert self._keyframe is not None
+        assert self._previous is not None
+        if self._config.references == "previous":
+            return [self._previous]
+        if self._config.references == "keyframe" or self._keyframe is self._previous:
+            return [self._keyframe]
+        return [self._keyframe, self._previous]
+
+    def _levenberg_marquardt(
+        self,
+        current: _Reference,
+        references: list[tuple[_Reference, np.ndarray]],  # with their T_world_camera
+        T_world_camera: np.ndarray,  # [4, 4] start
+        level: int,
+    ) -> tuple[np.ndarray, NormalEquations]:
+        T, damping = T_world_camera, 1e-4
+        system = self._system(current, references, T, level)
+        for _ in range(self._config.iterations):
+            if system.num_surface < MIN_PIXELS:
+                break
+            H = system.H + damping * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
+            step = -np.linalg.solve(H, system.g)
+            candidate_T = T @ se3_exp(torch.from_numpy(step)).numpy()
+            candidate = self._system(current, references, candidate_T, level)
+            if _mean_cost(candidate) < _mean_cost(system):
+                T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
+                if np.abs(step).max() < SMALL_STEP * 2**level * 10:
+                    break
+            else:
+                damping *= 8
+                if damping > 1e3:
+                    break
+        return T, system
+
+    def _system(
+        self,
+        current: _Reference,
+        references: list[tuple[_Reference, np.ndarray]],
+        T_world_camera: np.ndarray,
+        level: int,
+    ) -> NormalEquations:
+        """Return Eq. 5's normal equations over all references, for T_world_camera <- T exp(xi)."""
+        now = current.frame.level(level)
+        total: NormalEquations | None = None
+        for reference, T_world_reference in references:
+            then = reference.frame.level(level)
+            T_reference_camera = np.linalg.inv(T_world_reference) @ T_world_camera
+            T_camera_reference = np.linalg.inv(T_reference_camera)
+            intrinsics = now.camera.intrinsics
+            # source <- target and target <- source: both directions of Eq. 5
+            system = normal_equations(
+                reference.patches[level], now.surface, now.depth, T_camera_reference, intrinsics,
+                self._model, inverse=True,
+            )  # fmt: skip
+            if current.frame.depth is not None:
+                system += normal_equations(
+                    current.patches[level], then.surface, then.depth, T_reference_camera, intrinsics,
+                    self._model,
+                )  # fmt: skip
+            # The twist acts on the reference's side; exp(xi_r) T = T exp(Ad(T^-1) xi_r).
+            A = adjoint(T_reference_camera)
+            system = NormalEquations(
+                A.T @ system.H @ A, A.T @ system.g, system.cost,
+                system.num_surface, system.num_depth, system.num_usable,
+            )  # fmt: skip
+            total = system if total is None else total + system
+        assert total is not None
+        return total
+
+    def _draw_patches(self, frame: Frame) -> list[Patches]:
+        """Draw patches where the time surface exceeds its threshold and depth is known."""
+        config = self._config
+        finest = frame.level(0)
+        rows, columns = np.nonzero((finest.surface > config.min_time_surface) & (finest.depth > 0))
+        chosen = self._random.permutation(len(rows))[: config.num_patches]
+        centres = np.stack([columns[chosen], rows[chosen]], -1)
+        patches = []
+        for k in range(config.levels):
+            level = frame.level(k)
+            size = config.patch_size if k == 0 else max(3, config.patch_size // 2 | 1)
+            at_level = np.unique(centres >> k, axis=0) if k else centres
+            patches.append(extract_patches(level.surface, level.depth, at_level.astype(np.int32), size))
+        return patches
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]
+    """Return Ad(T) for twists (translation, rotation): T exp(xi) = exp(Ad(T) xi) T."""
+    R, t = T[:3, :3], T[:3, 3]
+    t_cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[:3, 3:] = t_cross @ R
+    return result
+
+
+def _mean_cost(system: NormalEquations) -> float:
+    """Return the cost per visible pixel, with a charge for pixels lost from view."""
+    if system.num_surface == 0:
+        return np.inf
+    lost = max(system.num_usable - system.num_surface, 0)
+    return (system.cost + 1.0 * lost) / max(system.num_usable, 1)
