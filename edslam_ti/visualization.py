@@ -1,0 +1,593 @@
+"""Seeing a run: plots of trajectories and renders (matplotlib, no display) and an Open3D window."""
+
+import json
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError, EdSlamError
+from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.output import atomic_file
+from edslam_ti.trajectory import Trajectory, read_tum
+from edslam_ti.volume import MeshView
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Colour-blind safe (Okabe and Ito); the truth is black.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+START, END = "#009E73", "#D55E00"
+MAX_DRAWN_POINTS = 60_000
+
+
+# ---------------------------------------------------------------- trajectories
+
+
+@dataclass(frozen=True)
+class AlignedPath:
+    """An estimate moved rigidly onto the truth, with its error at every pose."""
+
+    positions: np.ndarray  # [F, 3] metres
+    errors: np.ndarray  # [F] metres; NaN outside the truth's time range
+
+    @property
+    def ate_rmse(self) -> float:
+        """Root mean square position error in metres; NaN without truth."""
+        known = self.errors[np.isfinite(self.errors)]
+        return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+
+
+def align_to_truth(estimate: Trajectory, truth: Trajectory | None) -> AlignedPath:
+    """Return the estimate under the rigid motion that minimises its squared distances to the truth.
+
+    Without truth, or with fewer than two poses inside its time range, the estimate stays as it is.
+    """
+    positions = estimate.poses[:, :3, 3]
+    errors = np.full(len(positions), np.nan)
+    if truth is None:
+        return AlignedPath(positions, errors)
+    known = np.array([truth.covers(t) for t in estimate.timestamps], dtype=bool)
+    if np.count_nonzero(known) < 2:
+        return AlignedPath(positions, errors)
+    target = np.array([truth.at(t)[:3, 3] for t in estimate.timestamps[known]])
+    source = positions[known]
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    # Kabsch 1976; a camera that stood still fixes no rotation.
+    rotation = Rotation.identity()
+    if np.ptp(source, axis=0).max() > 0 and np.ptp(target, axis=0).max() > 0:
+        rotation, _ = Rotation.align_vectors(target - target_mean, source - source_mean)
+    aligned = rotation.apply(positions - source_mean) + target_mean
+    errors[known] = np.linalg.norm(aligned[known] - target, axis=1)
+    return AlignedPath(aligned, errors)
+
+
+def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> None:
+    """Draw top and side views of estimates, aligned to the truth when there is one.
+
+    A single estimate is coloured by its position error; several by name.
+    """
+    paths = {
+        name: align_to_truth(estimate, truth) for name, estimate in estimates.items() if len(estimate) > 0
+    }
+    if not paths:
+        raise DataError(f"{path.name}: expected at least one trajectory with poses, got none")
+    figure = _figure(11, 5)
+    views = _top_and_side(next(e for e in estimates.values() if len(e)) if truth is None else truth)
+    axes = figure.subplots(1, 2)
+    for ax, view in zip(axes, views):
+        if truth is not None and len(truth):
+            _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
+        only = next(iter(paths.values())) if len(paths) == 1 else None
+        if only is not None and np.isfinite(only.errors).sum() >= 2:
+            bar = _draw_errors(ax, only, view)
+            if ax is axes[-1]:
+                figure.colorbar(bar, ax=list(axes), label="position error [cm]", fraction=0.03, pad=0.02)
+        else:
+            for (name, aligned), color in zip(paths.items(), _colours()):
+                _draw_path(ax, aligned.positions, view, color=color, label=_with_ate(name, aligned))
+        first = next(iter(paths.values())).positions
+        _mark_ends(ax, first, view)
+        _finish_axes(ax, view)
+    _legend(axes[0])
+    figure.suptitle(
+        ", ".join(_with_ate(name, aligned) for name, aligned in paths.items())
+        + ("" if truth is None else " (rigidly aligned)")
+    )
+    _save(figure, path)
+
+
+@dataclass(frozen=True)
+class _PlanarView:
+    """Two world axes drawn right and up, with their signs."""
+
+    title: str
+    right: int
+    up: int
+    up_sign: float = 1.0
+
+    def project(self, positions: np.ndarray) -> np.ndarray:  # [F, 3] -> [F, 2]
+        return np.stack([positions[:, self.right], self.up_sign * positions[:, self.up]], -1)
+
+
+def _top_and_side(trajectory: Trajectory) -> tuple[_PlanarView, _PlanarView]:
+    """Return views along and across the vertical: the world axis nearest to the mean image column."""
+    down = trajectory.poses[:, :3, 1].mean(0)  # camera y points down
+    vertical = int(np.abs(down).argmax())
+    extent = np.ptp(trajectory.poses[:, :3, 3], axis=0)
+    a, b = (k for k in range(3) if k != vertical)
+    side = a if extent[a] >= extent[b] else b
+    return (
+        _PlanarView("top view", a, b),
+        _PlanarView("side view", side, vertical, up_sign=-1.0 if down[vertical] > 0 else 1.0),
+    )
+
+
+def _draw_path(ax: "Axes", positions: np.ndarray, view: _PlanarView, **style: Any) -> None:
+    style = {"linewidth": 1.6, **style}
+    ax.plot(*view.project(positions).T, **style)
+
+
+def _draw_errors(ax: "Axes", aligned: AlignedPath, view: _PlanarView) -> Any:
+    """Draw a path coloured by its error in centimetres and return what a colour bar needs."""
+    from matplotlib.collections import LineCollection
+
+    points = view.project(aligned.positions)
+    segments = np.stack([points[:-1], points[1:]], axis=1)  # [F - 1, 2, 2]
+    centimetres = 100 * aligned.errors
+    lines = LineCollection(list(segments), cmap="plasma", linewidth=2.5)
+    lines.set_array(np.fmax(centimetres[:-1], centimetres[1:]))
+    lines.set_clim(0.0, max(float(np.nanmax(centimetres)), 1e-3))
+    ax.add_collection(lines)
+    ax.autoscale_view()
+    return lines
+
+
+def _mark_ends(ax: "Axes", positions: np.ndarray, view: _PlanarView) -> None:
+    start, end = view.project(positions[[0, -1]])
+    ax.plot(*start, "o", color=START, markersize=8, markeredgecolor="white", label="start", zorder=5)
+    ax.plot(*end, "s", color=END, markersize=8, markeredgecolor="white", label="end", zorder=5)
+
+
+def _finish_axes(ax: "Axes", view: _PlanarView) -> None:
+    name = "xyz"
+    sign = "-" if view.up_sign < 0 else ""
+    ax.set(title=view.title, xlabel=f"{name[view.right]} [m]", ylabel=f"{sign}{name[view.up]} [m]")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.08)
+    ax.grid(alpha=0.3)
+
+
+def _with_ate(name: str, aligned: AlignedPath) -> str:
+    return name if np.isnan(aligned.ate_rmse) else f"{name}: ATE {100 * aligned.ate_rmse:.2f} cm rmse"
+
+
+# ---------------------------------------------------------------- renders
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What is shown of one view: brightness as displayed, the true image, and depth."""
+
+    name: str  # file name without suffix
+    render: np.ndarray  # [H, W] in [0, 1]
+    truth: np.ndarray | None  # [H, W] in [0, 1]
+    depth: np.ndarray  # [H, W] metres, 0 = nothing
+    caption: str  # time and metrics
+
+
+def write_render_triptychs(folder: Path, views: Iterable[RenderedView]) -> list[Path]:
+    """Write render | truth | depth side by side, one PNG per view, and return their paths."""
+    paths = []
+    for view in views:
+        paths.append(folder / f"{view.name}.png")
+        _write_triptych(paths[-1], view)
+    return paths
+
+
+def _write_triptych(path: Path, view: RenderedView) -> None:
+    height, width = view.render.shape
+    for name, image in (("truth", view.truth), ("depth", view.depth)):
+        if image is not None and image.shape != view.render.shape:
+            raise DataError(f"{name}: expected shape {view.render.shape} as the render's, got {image.shape}")
+    zoom = max(1, round(320 / width))  # small images are enlarged by a whole number
+    w, h, gap, head, foot = width * zoom, height * zoom, 8, 44, 40
+    total_w, total_h = 3 * w + 4 * gap, head + h + foot
+    figure = _figure(total_w / 100, total_h / 100, dpi=100, layout="none")
+
+    def panel(column: int, title: str) -> "Axes":
+        left = gap + column * (w + gap)
+        ax = figure.add_axes((left / total_w, foot / total_h, w / total_w, h / total_h))
+        ax.set_axis_off()
+        figure.text((left + w / 2) / total_w, (foot + h + 5) / total_h, title, ha="center", fontsize=9)
+        return ax
+
+    grey: dict[str, Any] = {
+        "cmap": "gray",
+        "vmin": 0.0,
+        "vmax": 1.0,
+        "interpolation": "nearest",
+        "aspect": "auto",
+    }
+    panel(0, "render").imshow(view.render, **grey)
+    truth_axes = panel(1, "truth")
+    if view.truth is None:
+        truth_axes.imshow(np.full(view.render.shape, 0.92), **grey)
+        truth_axes.text(0.5, 0.5, "no truth", transform=truth_axes.transAxes, ha="center", color="0.4")
+    else:
+        truth_axes.imshow(view.truth, **grey)
+    known = view.depth > 0
+    near, far = np.percentile(view.depth[known], (1, 99)) if known.any() else (0.0, 1.0)
+    depth = np.ma.masked_array(view.depth, ~known)
+    drawn = panel(2, "depth").imshow(
+        depth, cmap="viridis", vmin=near, vmax=max(far, near + 1e-3), interpolation="nearest", aspect="auto"
+    )
+    left = gap + 2 * (w + gap)
+    scale = figure.add_axes(((left + 0.1 * w) / total_w, 24 / total_h, 0.8 * w / total_w, 9 / total_h))
+    bar = figure.colorbar(drawn, cax=scale, orientation="horizontal", ticks=list(np.linspace(near, far, 3)))
+    bar.ax.set_xticklabels([f"{d:.2f} m" for d in np.linspace(near, far, 3)], fontsize=7)
+    bar.ax.tick_params(length=2, pad=2)
+    figure.text(gap / total_w, 1 - 16 / total_h, view.caption, fontsize=9, fontweight="bold")
+    _save(figure, path)
+
+
+# ---------------------------------------------------------------- finished runs
+
+
+@dataclass(frozen=True)
+class Result:
+    """What can be shown of a results folder; parts a run did not make are None."""
+
+    folder: Path
+    trajectory: Trajectory
+    truth: Trajectory | None
+    metrics: dict[str, Any]
+    points: np.ndarray | None  # [N, 3] metres
+    brightness: np.ndarray | None  # [N]
+    mesh: Any | None  # open3d TriangleMesh
+
+    @property
+    def title(self) -> str:
+        """Scene, method and ATE, as far as metrics.json tells, else the folder's name."""
+        words = [str(self.metrics[key]) for key in ("scene", "method") if self.metrics.get(key)]
+        ate = self.metrics.get("ate_rmse_cm")
+        name = " ".join(words) or self.folder.name
+        return name if ate is None else f"{name}: ATE {ate:.2f} cm rmse"
+
+
+def load_result(folder: Path) -> Result:
+    """Read a results folder; it must hold `trajectory_tum.txt`, all else is optional."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: results folder not found")
+    trajectory_path = folder / "trajectory_tum.txt"
+    if not trajectory_path.is_file():
+        raise DataError(
+            f"{folder}: not a results folder (no trajectory_tum.txt); give one that apps/slam.py made"
+        )
+    truth_path, metrics_path = folder / "truth_tum.txt", folder / "metrics.json"
+    try:
+        metrics = json.loads(metrics_path.read_text()) if metrics_path.is_file() else {}
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{metrics_path}: not readable as JSON ({error})") from error
+    points = brightness = mesh = None
+    o3d = load_open3d()
+    if (folder / "points.ply").is_file():
+        cloud = o3d.io.read_point_cloud(str(folder / "points.ply"))
+        if not len(cloud.points):
+            raise DataError(f"{folder / 'points.ply'}: expected a point cloud, could not read any point")
+        points = np.asarray(cloud.points)
+        brightness = np.asarray(cloud.colors).mean(1) if cloud.has_colors() else np.full(len(points), 0.5)
+    if (folder / "mesh.ply").is_file():
+        mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
+        if not len(mesh.triangles):
+            raise DataError(f"{folder / 'mesh.ply'}: expected a mesh, could not read any triangle")
+    return Result(
+        folder=folder,
+        trajectory=read_tum(trajectory_path),
+        truth=read_tum(truth_path) if truth_path.is_file() else None,
+        metrics=metrics,
+        points=points,
+        brightness=brightness,
+        mesh=mesh,
+    )
+
+
+def draw_results(results: Sequence[Path], path: Path) -> None:
+    """Draw finished runs into one picture without a display: mesh or points, and trajectories."""
+    runs = [load_result(folder) for folder in results]
+    if not runs:
+        raise DataError("results: expected at least one results folder, got none")
+    figure = _figure(12, 9)
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.15, 1))
+    overview = figure.add_subplot(grid[0, :])
+    _draw_overview(overview, runs)
+    truth = next((run.truth for run in runs if run.truth is not None), None)
+    views = _top_and_side(truth or runs[0].trajectory)
+    for k, view in enumerate(views):
+        ax = figure.add_subplot(grid[1, k])
+        _draw_points(ax, runs, view)
+        if truth is not None:
+            _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
+        for run, color in zip(runs, _colours()):
+            _draw_path(ax, run.trajectory.poses[:, :3, 3], view, color=color, label=run.title, linewidth=2)
+        _mark_ends(ax, runs[0].trajectory.poses[:, :3, 3], view)
+        _finish_axes(ax, view)
+        if k == 0:
+            _legend(ax)
+    _save(figure, path)
+
+
+def _draw_points(ax: "Axes", runs: Sequence[Result], view: _PlanarView) -> None:
+    """Draw the map points of every run that has some, in their brightness."""
+    for run in runs:
+        if run.points is None or run.brightness is None:
+            continue
+        chosen = np.linspace(0, len(run.points) - 1, min(len(run.points), MAX_DRAWN_POINTS)).astype(int)
+        x, y = view.project(run.points[chosen]).T
+        ax.scatter(x, y, 0.3, run.brightness[chosen], cmap="gray", vmin=0, vmax=1, alpha=0.5, linewidths=0)
+
+
+def _draw_overview(ax: "Axes", runs: Sequence[Result]) -> None:
+    """Draw the first run that has a mesh (else points) from behind its first camera, with all paths."""
+    shown = next((run for run in runs if run.mesh is not None), None)
+    shown = shown or next((run for run in runs if run.points is not None), runs[0])
+    camera = Camera(width=960, height=480, fx=500.0, fy=500.0, cx=479.5, cy=239.5)
+    T_world_view = _view_from_behind(shown.trajectory)
+    image = np.full(camera.shape, 0.12)
+    if shown.mesh is not None:
+        brightness, depth = MeshView(shown.mesh).render(camera, T_world_view)
+        image[depth > 0] = brightness[depth > 0]
+    elif shown.points is not None and shown.brightness is not None:
+        _splat_points(image, shown.points, shown.brightness, camera, T_world_view)
+    ax.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
+    for run, color in zip(runs, _colours()):
+        pixels, depth = _project(run.trajectory.poses[:, :3, 3], camera, T_world_view)
+        pixels[depth < 0.05] = np.nan
+        ax.plot(*pixels.T, color=color, linewidth=2)
+        for T in run.trajectory.poses[:: max(1, len(run.trajectory) // 6)]:
+            for line in _frustum_lines(T, camera, size=0.08):
+                corners, line_depth = _project(line, camera, T_world_view)
+                if (line_depth > 0.05).all():
+                    ax.plot(*corners.T, color=color, linewidth=0.7)
+    what = "mesh" if shown.mesh is not None else "points" if shown.points is not None else "no map"
+    ax.set(xlim=(0, camera.width - 1), ylim=(camera.height - 1, 0), xticks=[], yticks=[])
+    ax.set_title(f"{shown.title} ({what}, seen from behind the first camera)")
+
+
+def _view_from_behind(trajectory: Trajectory, back: float = 0.9, up: float = 0.25) -> np.ndarray:  # [4, 4]
+    """Return a pose `back` metres behind and `up` metres above the first camera, looking its way."""
+    T = trajectory.poses[0].copy()
+    T[:3, 3] = trajectory.poses[:, :3, 3].mean(0) - back * T[:3, 2] - up * T[:3, 1]
+    return T
+
+
+def _project(points: np.ndarray, camera: Camera, T_world_view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels [N, 2] and depths [N] of world points [N, 3]; pixels behind the view are NaN."""
+    T = np.linalg.inv(T_world_view)
+    p = points @ T[:3, :3].T + T[:3, 3]
+    z = np.where(p[:, 2] > 1e-6, p[:, 2], np.nan)
+    pixels = np.stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy], -1)
+    return pixels, p[:, 2]
+
+
+def _splat_points(
+    image: np.ndarray,  # [H, W], drawn into
+    points: np.ndarray,  # [N, 3]
+    brightness: np.ndarray,  # [N]
+    camera: Camera,
+    T_world_view: np.ndarray,
+) -> None:
+    """Draw points as 2x2 pixels, the nearest on top."""
+    pixels, depth = _project(points, camera, T_world_view)
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (depth > 0.05) & (pixels >= 0).all(1) & (pixels < (camera.width - 2, camera.height - 2)).all(1)
+        )
+    order = np.flatnonzero(inside)[np.argsort(-depth[inside])]
+    x, y = pixels[order].astype(int).T
+    for dy, dx in np.ndindex(2, 2):
+        image[y + dy, x + dx] = brightness[order]
+
+
+# ---------------------------------------------------------------- the window
+
+
+class RunViewer(Protocol):
+    """Follows a run."""
+
+    def update(
+        self,
+        trajectory: Trajectory,
+        keyframe_poses: Sequence[np.ndarray],  # [4, 4] each
+        points: np.ndarray,  # [N, 3] metres
+        colors: np.ndarray,  # [N] brightness in [0, 1]
+    ) -> None:
+        """Show the state of the run and return at once."""
+
+    def close(self) -> None:
+        """Take the window away."""
+
+
+class StubViewer:
+    """Shows nothing."""
+
+    def update(
+        self,
+        trajectory: Trajectory,
+        keyframe_poses: Sequence[np.ndarray],
+        points: np.ndarray,
+        colors: np.ndarray,
+    ) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def check_display() -> None:
+    """Raise EdSlamError where no window can be opened."""
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise EdSlamError(
+            "--visualize: no display found (neither DISPLAY nor WAYLAND_DISPLAY is set); run without it "
+            "and draw the results afterwards: python apps/view.py RESULT --save FILE.png"
+        )
+
+
+class Viewer:
+    """An Open3D window that follows a run: trajectory, keyframe frusta and map points."""
+
+    def __init__(self, camera: Camera, title: str = "ED-SLAM") -> None:
+        """Open the window, or raise EdSlamError where that is impossible."""
+        check_display()
+        self._camera = camera
+        self._o3d = o3d = load_open3d()
+        self._window = o3d.visualization.Visualizer()
+        if not self._window.create_window(window_name=title, width=1280, height=720):
+            raise EdSlamError("--visualize: Open3D could not open a window (no OpenGL?); run without it")
+        self._path = o3d.geometry.LineSet()
+        self._frusta = o3d.geometry.LineSet()
+        self._cloud = o3d.geometry.PointCloud()
+        self._is_empty = True
+
+    def update(
+        self,
+        trajectory: Trajectory,
+        keyframe_poses: Sequence[np.ndarray],
+        points: np.ndarray,
+        colors: np.ndarray,
+    ) -> None:
+        """Show the state of the run and return at once; a window that was closed stays closed."""
+        if len(trajectory) < 2 or len(points) == 0:
+            return
+        fill_lines(self._o3d, self._path, path_lines(trajectory.poses[:, :3, 3]), COLOURS[0])
+        current = [trajectory.poses[-1]]
+        lines = [line for T in [*keyframe_poses, *current] for line in _frustum_lines(T, self._camera)]
+        fill_lines(self._o3d, self._frusta, lines, COLOURS[1])
+        fill_cloud(self._o3d, self._cloud, points, colors)
+        for shape in (self._path, self._frusta, self._cloud):
+            if self._is_empty:
+                self._window.add_geometry(shape, reset_bounding_box=True)
+            else:
+                self._window.update_geometry(shape)
+        if self._is_empty:
+            self._look_along(trajectory.poses[0])
+        self._is_empty = False
+        self._window.poll_events()
+        self._window.update_renderer()
+
+    def close(self) -> None:
+        """Take the window away."""
+        self._window.destroy_window()
+
+    def _look_along(self, T_world_camera: np.ndarray) -> None:
+        control = self._window.get_view_control()
+        control.set_front(-T_world_camera[:3, 2])  # from the scene to the eye
+        control.set_up(-T_world_camera[:3, 1])
+        control.set_zoom(0.4)
+
+
+def make_viewer(enabled: bool, camera: Camera) -> RunViewer:
+    """Return a window that follows the run, or a viewer that shows nothing."""
+    return Viewer(camera) if enabled else StubViewer()
+
+
+def show_results(results: Sequence[Path]) -> None:
+    """Show finished runs in an Open3D window until it is closed."""
+    check_display()
+    runs = [load_result(folder) for folder in results]
+    o3d = load_open3d()
+    shapes: list[Any] = []
+    for run, color in zip(runs, _colours()):
+        path = o3d.geometry.LineSet()
+        lines = path_lines(run.trajectory.poses[:, :3, 3])
+        every = max(1, len(run.trajectory) // 30)
+        camera = Camera(width=4, height=3, fx=3.0, fy=3.0, cx=1.5, cy=1.0)
+        lines += [line for T in run.trajectory.poses[::every] for line in _frustum_lines(T, camera)]
+        fill_lines(o3d, path, lines, color)
+        shapes.append(path)
+        if run.mesh is not None:
+            run.mesh.compute_vertex_normals()
+            shapes.append(run.mesh)
+        elif run.points is not None and run.brightness is not None:
+            cloud = o3d.geometry.PointCloud()
+            fill_cloud(o3d, cloud, run.points, run.brightness)
+            shapes.append(cloud)
+    o3d.visualization.draw_geometries(shapes, window_name="; ".join(run.title for run in runs))
+
+
+def path_lines(positions: np.ndarray) -> list[np.ndarray]:  # [F, 3] -> F - 1 lines [2, 3]
+    """Return the segments of a path."""
+    return [positions[k : k + 2] for k in range(len(positions) - 1)]
+
+
+def _frustum_lines(T_world_camera: np.ndarray, camera: Camera, size: float = 0.05) -> list[np.ndarray]:
+    """Return the eight edges [2, 3] of a camera's pyramid, `size` metres deep."""
+    columns, rows = (-0.5, camera.width - 0.5), (-0.5, camera.height - 0.5)
+    corners = np.array(
+        [
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]
+            for u, v in (
+                (columns[0], rows[0]),
+                (columns[1], rows[0]),
+                (columns[1], rows[1]),
+                (columns[0], rows[1]),
+            )
+        ]
+    )  # [4, 3]
+    apex = T_world_camera[:3, 3]
+    base = size * corners @ T_world_camera[:3, :3].T + apex
+    return [np.stack([base[k], base[(k + 1) % 4]]) for k in range(4)] + [np.stack([apex, b]) for b in base]
+
+
+def fill_lines(o3d: Any, shape: Any, lines: Sequence[np.ndarray], color: str) -> None:
+    """Set an Open3D LineSet to lines [2, 3] of one colour."""
+    from matplotlib.colors import to_rgb
+
+    shape.points = o3d.utility.Vector3dVector(np.concatenate(lines))
+    shape.lines = o3d.utility.Vector2iVector(np.arange(2 * len(lines), dtype=np.int32).reshape(-1, 2))
+    shape.paint_uniform_color(to_rgb(color))
+
+
+def fill_cloud(o3d: Any, cloud: Any, points: np.ndarray, brightness: np.ndarray) -> None:
+    """Set an Open3D PointCloud to points [N, 3] in grey [N]."""
+    cloud.points = o3d.utility.Vector3dVector(np.asarray(points, np.float64))
+    grey = np.clip(np.reshape(brightness, (-1, 1)), 0, 1)
+    cloud.colors = o3d.utility.Vector3dVector(np.repeat(grey, 3, axis=1).astype(np.float64))
+
+
+# ---------------------------------------------------------------- matplotlib without global state
+
+
+def _figure(width: float, height: float, dpi: int = 120, layout: Any = "constrained") -> "Figure":
+    """Return a figure (inches) that belongs to nobody: no pyplot, so no display and no leak."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=dpi, layout=layout)
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    with atomic_file(path) as temporary:
+        figure.savefig(temporary, facecolor="white")
+
+
+def _legend(ax: "Axes") -> None:
+    handles, labels = ax.get_legend_handles_labels()
+    unique = dict(zip(labels, handles))
+    ax.legend(list(unique.values()), list(unique), fontsize=8, framealpha=0.8)
+
+
+def _colours() -> Iterable[str]:
+    while True:
+        yield from COLOURS
