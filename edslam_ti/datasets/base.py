@@ -39,6 +39,7 @@ class EventDepthSequence(ABC):
     depth_timestamps: np.ndarray  # [D] seconds, strictly increasing
     image_timestamps: np.ndarray  # [I] seconds, strictly increasing; may be empty
     description: str  # one line: what this is; a stand-in says so
+    time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
 
     @abstractmethod
     def depth(self, index: int) -> np.ndarray:
@@ -74,8 +75,9 @@ class EventDepthSequence(ABC):
 class SampledSequence:
     """A sequence cut to [start, start + duration] and divided into samples.
 
-    A sample ends at every depth image; gaps longer than `max_interval` are divided evenly by samples
-    without depth.
+    `start` counts from the first event or depth image, whichever is earlier, so that a recording cut out
+    of a longer one needs no other numbers. A sample ends at every depth image; gaps longer than
+    `max_interval` are divided evenly by samples without depth.
     """
 
     def __init__(
@@ -87,17 +89,18 @@ class SampledSequence:
     ) -> None:
         self.sequence = sequence
         first, last = sequence.time_range
-        end = np.inf if duration is None else start + duration
-        # Depth far outside the event stream has nothing to be tracked with.
         stamps = sequence.depth_timestamps
-        inside = stamps[(stamps >= start - 1e-9) & (stamps <= end + 1e-9)]
+        begin = min([first, *stamps[:1]]) + start
+        end = np.inf if duration is None else begin + duration
+        # Depth far outside the event stream has nothing to be tracked with.
+        inside = stamps[(stamps >= begin - 1e-9) & (stamps <= end + 1e-9)]
         inside = inside[(inside >= first - max_interval) & (inside <= last + max_interval)]
         if len(inside) < 2:
             depth_range = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else "nothing"
             raise DataError(
-                f"{sequence.scene}: expected at least 2 depth images between {start} s and "
-                f"{end if np.isfinite(end) else last:.3f} s, got {len(inside)}; depth covers {depth_range}, "
-                f"events {first:.3f} to {last:.3f} s; change --start or --duration"
+                f"{sequence.scene}: expected at least 2 depth images between {begin:.3f} s and "
+                f"{min(end, last):.3f} s, got {len(inside)}; depth covers {depth_range}, events "
+                f"{first:.3f} to {last:.3f} s; change --start or --duration (counted from the first of them)"
             )
         times, has_depth = [float(inside[0])], [True]
         for a, b in itertools.pairwise(inside):

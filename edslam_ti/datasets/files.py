@@ -1,0 +1,113 @@
+"""Reading the small files around an event stream: number tables, images, depth images, numbered names."""
+
+import re
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError
+
+FARTHEST_DEPTH = 1e4  # m; renderers write 1e10 or 65504 (half-precision maximum) where they hit nothing
+
+
+def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, columns] float64
+    """Return the table in a text file of `columns` numbers a line; `line` describes one in messages."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} not found; expected lines '{line}'")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an empty file is refused below
+            rows = np.loadtxt(path, comments="#", ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path}: expected {columns} numbers a line '{line}'; {reason}") from error
+    if rows.size == 0:
+        raise DataError(f"{path}: expected lines '{line}', got an empty file")
+    if rows.shape[1] != columns:
+        raise DataError(f"{path}: expected {columns} numbers a line '{line}', got {rows.shape[1]}")
+    finite = np.isfinite(rows).all(1)
+    if not finite.all():
+        bad = int(finite.argmin())
+        raise DataError(f"{path}: row {bad + 1} of the table holds a value that is not finite: {rows[bad]}")
+    return rows
+
+
+def numbered_files(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Return the files of a folder by the last number in their names, in ascending order."""
+    found: dict[int, Path] = {}
+    files = [p for p in sorted(folder.glob("*")) if p.suffix.lower() in suffixes and p.name[0] != "."]
+    matching = [p for p in files if p.match(pattern)]
+    if files and not matching:
+        raise DataError(f"{folder}: expected files named {pattern}{suffixes[0]}, found {files[0].name}")
+    for path in matching:
+        numbers = re.findall(r"\d+", path.stem)
+        if not numbers:
+            raise DataError(f"{path}: expected a number in the file name, as in frame000100{path.suffix}")
+        key = int(numbers[-1])
+        if key in found:
+            raise DataError(f"{folder}: {found[key].name} and {path.name} both carry number {key}; keep one")
+        found[key] = path
+    return dict(sorted(found.items()))
+
+
+def read_image(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32 in [0, 1]
+    """Return an image file as grey values of the camera's size."""
+    image = _decode(path, cv2.IMREAD_GRAYSCALE)
+    _check_size(path, image, camera, "image")
+    return image.astype(np.float32) / 255
+
+
+def read_depth(path: Path, camera: Camera, metres_per_unit: float) -> np.ndarray:  # [H, W] float32, m
+    """Return a depth image: PNG of 16 bits in `metres_per_unit`, or EXR in metres; 0 = missing.
+
+    EXR values of 10 km and more are what renderers write for "nothing hit" and become 0.
+    """
+    depth = _decode(path, cv2.IMREAD_UNCHANGED)
+    if path.suffix.lower() == ".exr":
+        if depth.ndim == 3:  # renderers repeat depth in R, G and B; OpenCV's order is B, G, R
+            depth = depth[..., min(2, depth.shape[2] - 1)]
+        _check_size(path, depth, camera, "depth")
+        depth = depth.astype(np.float32)
+        bad = ~np.isfinite(depth) | (depth < 0)
+        if bad.any():
+            v, u = np.argwhere(bad)[0]
+            raise DataError(
+                f"{path}: expected finite depth in metres, 0 where there is none, got {depth[v, u]} at "
+                f"column {u}, row {v} ({int(bad.sum())} such pixels)"
+            )
+        return np.where(depth >= FARTHEST_DEPTH, np.float32(0), depth)
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise DataError(
+            f"{path}: expected a 16-bit single-channel depth PNG, got {depth.dtype} of shape {depth.shape}"
+        )
+    _check_size(path, depth, camera, "depth")
+    return depth.astype(np.float32) * np.float32(metres_per_unit)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of an image file."""
+    height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    return width, height
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: image not found")
+    try:
+        image = cv2.imread(str(path), flags)
+    except cv2.error as error:
+        raise DataError(f"{path}: not readable as an image ({' '.join(str(error).split())})") from error
+    if image is None:
+        raise DataError(f"{path}: not readable as an image; truncated or not a {path.suffix[1:]} file?")
+    return np.asarray(image)
+
+
+def _check_size(path: Path, image: np.ndarray, camera: Camera, what: str) -> None:
+    if image.shape[:2] != camera.shape:
+        raise DataError(
+            f"{path}: {what}: expected the camera's {camera.width}x{camera.height} pixels, got "
+            f"{image.shape[1]}x{image.shape[0]}; state the true camera in camera.json or resize"
+        )

@@ -1,0 +1,213 @@
+"""RPG Event Camera Dataset, text layout (Mueggler et al. 2017), with depth images added.
+
+    events.txt          t [s] x y p{0,1}
+    images.txt          t [s] path                       optional
+    groundtruth.txt     t [s] tx ty tz qx qy qz qw       optional; T_world_camera
+    calib.txt           fx fy cx cy k1 k2 p1 p2 k3       pixel centres at integers
+    depth/*.png or derived_depth/*.png                   16 bits; the number in the name is the line (from 0)
+                                                         of images.txt that holds its time
+
+The dataset itself has no depth. Depth images are expected undistorted, pixel for pixel in the camera of
+this loader (K of calib.txt, no distortion), in 1/5000 m as in TUM RGB-D; a `camera.json` {"depth_scale": S}
+states another unit. Found on slider_depth by warping images with its `derived_depth` (plane sweep, not
+sensor data) between the true poses: 1/5000 m fits (half and double are four times worse), undistorted fits
+better than distorted, and the poses are camera-to-world in OpenCV axes (x to the right).
+
+Events and images are undistorted here; an event goes to the nearest pixel, or is dropped outside.
+"""
+
+import hashlib
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+import platformdirs
+
+from edslam_ti.camera import Camera
+from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.datasets.event_file import EventFile
+from edslam_ti.datasets.event_replica import LATEST_START, read_camera
+from edslam_ti.datasets.files import image_size, numbered_files, read_depth, read_image, read_numbers
+from edslam_ti.errors import DataError
+from edslam_ti.events import Events
+from edslam_ti.output import atomic_file
+from edslam_ti.trajectory import Trajectory, read_tum
+
+DAVIS240C = (240, 180)  # width, height: the dataset's sensor, where no image tells
+TUM_DEPTH_SCALE = 5000.0  # PNG units in a metre
+ROWS_AT_A_TIME = 1_000_000
+SLOW_TO_PARSE = 200_000_000  # bytes of text: about ten seconds
+
+
+class RpgSequence(EventDepthSequence):
+    """A folder in the RPG Event Camera Dataset's text layout, undistorted."""
+
+    dataset = "rpg"
+    contrast_threshold = None
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: sequence folder not found")
+        self.scene = folder.name
+        K = read_numbers(folder / "calib.txt", 9, "fx fy cx cy k1 k2 p1 p2 k3")[0]
+        image_times, image_files = _read_image_list(folder)
+        depth, depth_folder = _depth_files(folder, len(image_times))
+        width, height = image_size(image_files[0]) if image_files else image_size(next(iter(depth.values())))
+        self.camera = Camera(width, height, *(float(v) for v in K[:4]))
+        self._distortion = K[4:]
+        self._depth_files = list(depth.values())
+        self._image_files = image_files
+        measured = "measured" if depth_folder == "depth" else "derived from the true poses, not measured"
+        self.description = f"RPG Event Camera Dataset layout, {folder}, undistorted; depth {measured}"
+
+        stated = read_camera(folder / "camera.json")
+        scale_is_given = "depth_scale" in stated.model_fields_set
+        self._metres_per_unit = stated.metres_per_unit if scale_is_given else 1 / TUM_DEPTH_SCALE
+
+        self._events = open_text_events(folder / "events.txt", width, height)
+        first, _ = self._events.time_range
+        self.time_offset = first if abs(first) > LATEST_START else 0.0
+        if self.time_offset:
+            self._events = self._events.shifted(self.time_offset)
+        self.image_timestamps = image_times - self.time_offset
+        self.depth_timestamps = image_times[list(depth)] - self.time_offset
+        self.truth = None
+        if (folder / "groundtruth.txt").exists():
+            truth = read_tum(folder / "groundtruth.txt")
+            self.truth = Trajectory(truth.timestamps - self.time_offset, truth.poses)
+
+        matrix = self.camera.matrix
+        self._image_maps = cv2.initUndistortRectifyMap(
+            matrix, self._distortion, np.eye(3), matrix, (width, height), cv2.CV_32FC1
+        )
+        self._undistorted_pixel = _undistortion_table(self.camera, self._distortion)
+        self.depth(0)
+        if image_files:
+            self.image(0)
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        return self._events.time_range
+
+    def events(self, start: float, end: float) -> Events:
+        raw = self._events.between(start, end)
+        x, y = self._undistorted_pixel[raw.y, raw.x].T
+        inside = x >= 0
+        return Events(x[inside], y[inside], raw.t[inside], raw.polarity[inside])
+
+    def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+        return read_depth(self._depth_files[index], self.camera, self._metres_per_unit)
+
+    def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
+        raw = read_image(self._image_files[index], self.camera)
+        return np.asarray(cv2.remap(raw, *self._image_maps, interpolation=cv2.INTER_LINEAR))
+
+
+def _undistortion_table(camera: Camera, distortion: np.ndarray) -> np.ndarray:  # [H, W, 2] int16
+    """Return for every distorted pixel its nearest undistorted one (x, y); (-1, -1) where outside."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+    pixels = np.stack([u.ravel(), v.ravel()], -1)[:, None]
+    undistorted = cv2.undistortPoints(pixels, camera.matrix, distortion, P=camera.matrix)
+    nearest = np.rint(np.asarray(undistorted).reshape(camera.height, camera.width, 2))
+    outside = ((nearest < 0) | (nearest >= np.array([camera.width, camera.height]))).any(-1)
+    nearest[outside] = -1
+    return nearest.astype(np.int16)
+
+
+def _read_image_list(folder: Path) -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
+    """Read images.txt."""
+    path = folder / "images.txt"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} not found; expected lines 't path', which also give depth its times")
+    times: list[float] = []
+    files: list[Path] = []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            time, name = float(fields[0]), fields[1]
+        except (ValueError, IndexError) as error:
+            raise DataError(f"{path}: line {number}: expected 't path', got '{line}'") from error
+        if not np.isfinite(time) or (times and time <= times[-1]):
+            raise DataError(f"{path}: line {number}: expected increasing times in seconds, got {time}")
+        times.append(time)
+        files.append(folder / name)
+    if not files:
+        raise DataError(f"{path}: expected lines 't path', got an empty file")
+    return np.array(times), files
+
+
+def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:
+    """Return the depth images by the index of their time, and the name of their folder."""
+    for name in ("depth", "derived_depth"):
+        files = numbered_files(folder / name, "*", (".png",))
+        if files and max(files) >= num_times:
+            raise DataError(
+                f"{files[max(files)]}: images.txt has only {num_times} lines; expected the number in the "
+                "name to be the line (from 0) with the depth image's time"
+            )
+        if files:
+            return files, name
+    raise DataError(
+        f"{folder}: no depth found; expected depth/*.png or derived_depth/*.png (16 bits, undistorted, "
+        "numbered as the lines of images.txt)"
+    )
+
+
+def open_text_events(path: Path, width: int, height: int) -> EventFile:
+    """Return the events of a text file; it is parsed once, into a binary copy in the user's cache.
+
+    The copy is known by the text's path, size and time of change. $EDSLAM_CACHE moves the cache.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} not found; expected lines 't x y p'")
+    status = path.stat()
+    if status.st_size == 0:
+        raise DataError(f"{path}: the file is empty; expected lines 't x y p'")
+    identity = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}"
+    cache = Path(os.environ.get("EDSLAM_CACHE") or platformdirs.user_cache_dir("edslam_ti"))
+    binary = cache / "events" / f"{path.parent.name}_{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npy"
+    if not binary.is_file():
+        if status.st_size > SLOW_TO_PARSE:
+            print(f"reading {path} once ({status.st_size / 1e6:.0f} MB) ...", file=sys.stderr)
+        with atomic_file(binary) as temporary:
+            _parse_events(path, temporary)
+    return EventFile(binary, width, height, name=str(path), first_row=1)
+
+
+def _parse_events(text: Path, binary: Path) -> None:
+    """Write the rows 't x y p' of a text file as a float64 .npy of rows x, y, t, p."""
+    count = 0
+    with text.open() as source, binary.open("wb") as target, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # no rows left: the loop's end
+        _write_header(target, 0)
+        while True:
+            try:
+                rows = np.loadtxt(source, max_rows=ROWS_AT_A_TIME, comments=None, ndmin=2)
+            except ValueError as error:
+                raise DataError(
+                    f"{text}: expected lines 't x y p'; behind row {count}: {' '.join(str(error).split())}"
+                ) from error
+            if rows.size == 0:
+                break
+            if rows.shape[1] != 4:
+                raise DataError(f"{text}: expected 4 numbers a line 't x y p', got {rows.shape[1]}")
+            rows[:, [1, 2, 0, 3]].astype("<f8").tofile(target)
+            count += len(rows)
+            if len(rows) < ROWS_AT_A_TIME:
+                break
+        if count == 0:
+            raise DataError(f"{text}: expected lines 't x y p', got an empty file")
+        target.seek(0)
+        _write_header(target, count)
+
+
+def _write_header(file: BinaryIO, count: int) -> None:
+    """Write the .npy header; NumPy pads it so that the number of rows can be rewritten in place."""
+    header = {"descr": "<f8", "fortran_order": False, "shape": (count, 4)}
+    np.lib.format.write_array_header_1_0(file, header)
