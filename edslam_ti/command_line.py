@@ -7,13 +7,14 @@ Settings come from, each overriding the one before: defaults, configs/<dataset>.
 import contextlib
 import dataclasses
 import difflib
+import functools
 import io
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from pydantic import BaseModel
@@ -23,6 +24,9 @@ from edslam_ti.errors import ConfigError, EdSlamError
 
 CONFIG_HELP = "YAML file of settings; only those that differ from the defaults need be there."
 FAILED, USAGE, INTERRUPTED = 1, 2, 130  # exit codes; 130 is the shell's for Ctrl-C
+
+
+Result = TypeVar("Result")
 
 
 class UsageError(EdSlamError):
@@ -50,6 +54,28 @@ def parse_config(
     flags = parsed_over(merged(values, differences), "settings")
     del flags["config"]
     return Config._validated(flags, source="command line")
+
+
+def parse_arguments(
+    function: Callable[..., Result], argv: Sequence[str] | None, description: str | None = None
+) -> Result:
+    """Call a function with the arguments on the command line (tyro); for the apps without a `Config`."""
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    parsed: list[Callable[[], Result]] = []
+
+    @functools.wraps(function)
+    def remember(*args: Any, **kwargs: Any) -> None:
+        parsed.append(functools.partial(function, *args, **kwargs))
+
+    with _one_line_errors():
+        tyro.cli(
+            remember,
+            args=arguments,
+            description=description,
+            config=(tyro.conf.FlagConversionOff,),
+            registry=_REGISTRY,
+        )
+    return parsed[0]()  # outside: what the function raises is its own
 
 
 def launch(main: Callable[[], None]) -> None:
@@ -137,7 +163,7 @@ def _parse_flags(arguments: list[str], base: dict[str, Any], description: str | 
             return_unknown_args=True,
         )
     if unknown:
-        raise UsageError(_describe_unknown(unknown[0]))
+        raise UsageError(_describe_unknown(unknown[0], ["--config", *_options(Config)]))
     return {**dataclasses.asdict(parsed.settings), "config": parsed.config}
 
 
@@ -210,12 +236,11 @@ def _one_line_errors() -> Iterator[None]:
         raise UsageError(" ".join(lines) or "the command line cannot be read") from None
 
 
-def _describe_unknown(word: str) -> str:
+def _describe_unknown(word: str, known: list[str]) -> str:
     """Say which option was probably meant."""
     if not word.startswith("-"):
         return f"unexpected argument '{word}'; options look like --scene office0"
     option = word.split("=")[0].replace("_", "-")
-    known = ["--config", *_options(Config)]
     close = difflib.get_close_matches(option, known, n=1)
     if not close:  # `--enabled` for `--mapping.enabled`
         close = [name for name in known if name.endswith("." + option.lstrip("-"))][:1]

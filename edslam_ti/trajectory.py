@@ -1,5 +1,6 @@
 """A camera path: key poses over time, interpolated along geodesics (Eq. 9), read and written as TUM."""
 
+import bisect
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +64,7 @@ class Trajectory:
             raise DataError("trajectory: no pose yet")
         if len(self._poses) == 1:
             return self._poses[0].copy()
-        k = int(np.searchsorted(self._timestamps, timestamp, side="right")) - 1
+        k = bisect.bisect_right(self._timestamps, timestamp) - 1
         k = min(max(k, 0), len(self._poses) - 2)
         start, end = self._timestamps[k], self._timestamps[k + 1]
         pose = interpolate(
@@ -74,8 +75,13 @@ class Trajectory:
         return pose.numpy()
 
     def resampled(self, timestamps: np.ndarray) -> "Trajectory":
-        """Return the path at other times (strictly increasing)."""
-        return Trajectory(timestamps, np.array([self.at(t) for t in timestamps]))
+        """Return the path at other times (strictly increasing): `at` for all of them at once."""
+        if len(self._poses) < 2 or len(timestamps) == 0:
+            return Trajectory(timestamps, np.array([self.at(t) for t in timestamps]))
+        stamps, poses = self.timestamps, torch.from_numpy(self.poses)
+        k = np.clip(np.searchsorted(stamps, timestamps, side="right") - 1, 0, len(stamps) - 2)
+        fraction = torch.from_numpy((timestamps - stamps[k]) / (stamps[k + 1] - stamps[k]))
+        return Trajectory(timestamps, interpolate(poses[k], poses[k + 1], fraction).numpy())
 
     def length(self) -> float:
         """Return the length of the path in metres."""
