@@ -37,7 +37,7 @@ def _open3d_rgbd(
 ) -> tuple["Tracker", "Mapper"]:
     from edslam_ti.baselines.open3d_rgbd import RgbdOdometryTracker, TsdfMapper
 
-    return RgbdOdometryTracker(sequence.camera), TsdfMapper(sequence.camera)
+    return RgbdOdometryTracker(sequence), TsdfMapper(sequence.camera)
 
 
 METHODS: dict[str, Method] = {

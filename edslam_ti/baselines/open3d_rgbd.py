@@ -1,0 +1,139 @@
+"""RGB-D odometry and a TSDF volume from Open3D's own functions: a method is a pair of Tracker and Mapper.
+
+Re-implemented here from a library, not an author's system: hybrid photometric and geometric alignment
+(Park et al. 2017) to a reference frame, and volumetric fusion (Curless and Levoy 1996). It uses no
+events but looks at images, which an event camera may not have. Open3D adds up in parallel: two runs
+agree to about a micrometre, not to the last digit.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.errors import DataError
+from edslam_ti.frame import Frame
+from edslam_ti.geometry import orthonormalized, rotation_angle_deg
+from edslam_ti.mapping import Progress
+from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.rendering import View
+from edslam_ti.tracking import TrackingResult
+from edslam_ti.trajectory import Trajectory
+from edslam_ti.volume import MeshView, TsdfVolume
+
+MAX_DEPTH = 10.0  # metres
+VOXEL_SIZE = 0.02  # metres
+ITERATIONS = (10, 5, 3)  # coarse to fine, Open3D's default
+MIN_FITNESS = 0.3  # fraction of pixels with a partner; below, tracking has failed
+# A reference serves until the camera has moved this far. Partners are whole pixels, which hides motions
+# below one: from frame to frame the drift is several times larger.
+REFERENCE_DISTANCE = 0.1  # metres
+REFERENCE_ANGLE = 6.0  # degrees
+
+
+class RgbdOdometryTracker:
+    """Aligns each RGB-D frame to a reference frame (Tracker)."""
+
+    def __init__(self, sequence: EventDepthSequence) -> None:
+        """Check that the sequence has images where it has depth."""
+        depth_times, image_times = sequence.depth_timestamps, sequence.image_timestamps
+        gaps = np.abs(depth_times[:, None] - image_times[None]).min(1, initial=np.inf)  # [D] seconds
+        if np.count_nonzero(gaps <= 1e-3) < 2:
+            raise DataError(
+                f"{sequence.scene}: method open3d_rgbd needs images taken with the depth images, got "
+                f"{len(image_times)} images and {len(depth_times)} depth images, fewer than 2 of them "
+                "within 1 ms of each other; use --method ed_slam"
+            )
+        self._intrinsics = load_open3d().core.Tensor(sequence.camera.matrix)
+        self._reference: tuple[Any, np.ndarray] | None = None  # RGB-D image, T_world_camera
+
+    def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+        """Return the pose of `frame`; without depth or image it is the guess, and said to be lost."""
+        if frame.depth is None or frame.image is None:
+            missing = "depth image" if frame.depth is None else "image"
+            return TrackingResult(
+                T_world_camera_guess, False, 0.0, f"no {missing} at this time: pose predicted"
+            )
+        current = _rgbd_image(frame.depth, frame.image)
+        if self._reference is None:
+            self._reference = current, T_world_camera_guess
+            return TrackingResult(T_world_camera_guess, True, 1.0)
+        reference, T_world_reference = self._reference
+        T_guess = np.linalg.inv(T_world_reference) @ T_world_camera_guess
+        T_reference_camera, fitness = self._align(current, reference, T_guess)
+        converged = fitness >= MIN_FITNESS
+        pose = orthonormalized(T_world_reference @ T_reference_camera) if converged else T_world_camera_guess
+        distance = np.linalg.norm(T_reference_camera[:3, 3])
+        if (
+            not converged
+            or distance > REFERENCE_DISTANCE
+            or rotation_angle_deg(T_reference_camera) > REFERENCE_ANGLE
+        ):
+            self._reference = current, pose
+        message = "" if converged else f"only {fitness:.0%} of pixels found a partner: pose predicted"
+        return TrackingResult(pose, converged, fitness, message)
+
+    def _align(self, current: Any, reference: Any, T_guess: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return T_reference_camera and the fraction of pixels that support it."""
+        o3d = load_open3d()
+        odometry = o3d.t.pipelines.odometry
+        try:
+            result = odometry.rgbd_odometry_multi_scale(
+                current,
+                reference,
+                self._intrinsics,
+                o3d.core.Tensor(T_guess),
+                depth_scale=1.0,
+                depth_max=MAX_DEPTH,
+                criteria_list=[odometry.OdometryConvergenceCriteria(n) for n in ITERATIONS],
+                method=odometry.Method.Hybrid,
+            )
+        except RuntimeError:  # Open3D's answer to a singular system: nothing to align
+            return T_guess, 0.0
+        return result.transformation.numpy(), float(result.fitness)
+
+
+class TsdfMapper:
+    """Fuses tracked RGB-D frames into a signed distance volume (Mapper)."""
+
+    num_gaussians = 0
+    loss = float("nan")
+
+    def __init__(self, camera: Camera) -> None:
+        self._volume = TsdfVolume(camera, VOXEL_SIZE, MAX_DEPTH)
+        self._view: MeshView | None = None  # of the volume as it is now
+
+    def update(self, frame: Frame, trajectory: Trajectory) -> None:
+        """Fuse the newest frame, unless it is held out or lacks depth or image."""
+        if frame.is_held_out or frame.depth is None or frame.image is None:
+            return
+        self._volume.integrate(frame.depth, frame.image, trajectory.pose(-1))
+        self._view = None
+
+    def finish(self, trajectory: Trajectory, progress: Progress) -> None:
+        """Nothing is left to refine."""
+        progress(1.0)
+
+    def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
+        """Return the fused surface seen from a pose."""
+        if self._view is None:
+            self._view = MeshView(self._volume.mesh())
+        brightness, depth = self._view.render(camera, T_world_camera)
+        return View(brightness, depth, (depth > 0).astype(np.float32))
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the vertices of the fused surface [N, 3] and their brightness [N]."""
+        mesh = self._volume.mesh()
+        return np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors).reshape(-1, 3).mean(1)
+
+
+def _rgbd_image(depth: np.ndarray, image: np.ndarray) -> Any:
+    """Return Open3D's RGB-D image of depth [H, W] in metres and brightness [H, W] in [0, 1]."""
+    o3d = load_open3d()
+    grey = np.repeat(image[..., None], 3, axis=-1)  # [H, W, 3]
+    usable = np.where((depth > 0) & (depth < MAX_DEPTH), depth, 0)
+    return o3d.t.geometry.RGBDImage(
+        o3d.t.geometry.Image(np.ascontiguousarray(grey, np.float32)),
+        o3d.t.geometry.Image(np.ascontiguousarray(usable, np.float32)),
+    )
