@@ -40,20 +40,23 @@ def find_sequence(config: Config) -> tuple[str, Path | None]:
 
 
 def open_sequence(config: Config) -> EventDepthSequence:
-    """Open the scene that the settings name, and print which recording or stand-in it is."""
+    """Open the scene that the settings name; without --dataset, print which one that turned out to be."""
     dataset, folder = find_sequence(config)
-    if folder is None:
-        from edslam_ti.datasets.builtin import builtin_sequence_folder
-
-        sequence: EventDepthSequence = EventReplicaSequence(
-            builtin_sequence_folder(config.scene),
-            config.contrast_threshold,
-            description=f"built-in simulated room '{config.scene}', a stand-in for EventReplica's scene",
+    if config.dataset is None:
+        where = (
+            f"the recording in {folder}" if folder else f"none in {config.data_dir}, so the built-in stand-in"
         )
-        sequence.dataset, sequence.scene = "builtin", config.scene
-    else:
-        sequence = DATASETS[dataset](folder, config)
-    print(f"sequence: {sequence.description}", flush=True)
+        print(f"scene {config.scene}: {where}", flush=True)
+    if folder is not None:
+        return DATASETS[dataset](folder, config)
+    from edslam_ti.datasets.builtin import builtin_sequence_folder
+
+    sequence = EventReplicaSequence(
+        builtin_sequence_folder(config.scene),
+        config.contrast_threshold,
+        description=f"built-in simulated room '{config.scene}', a stand-in for EventReplica's scene",
+    )
+    sequence.dataset, sequence.scene = "builtin", config.scene
     return sequence
 
 

@@ -156,8 +156,9 @@ class EventFile:
         count = len(self)
         if count == 0:
             raise DataError(f"{self.name}: expected events, got an empty array of shape {self._layout.shape}")
-        starts = np.unique(np.linspace(0, max(0, count - PROBE_LENGTH), PROBES).astype(np.int64))
-        first = last = latest = None
+        starts = np.linspace(0, max(0, count - PROBE_LENGTH), PROBES).astype(np.int64)
+        first = last = float("nan")
+        seen = 0  # rows before this have been looked at, so that blocks of a small file do not overlap
         with self._mapped() as rows:
             ends = rows[[0, -1], 2].astype(np.float64)
             if np.isfinite(ends).all() and abs(ends[1] - ends[0]) > LONGEST_RECORDING:
@@ -167,16 +168,14 @@ class EventFile:
                     "nanoseconds: divide column 2 by 1e6 or 1e9"
                 )
             for start in starts:
-                stop = min(int(start) + PROBE_LENGTH, count)
-                _, _, t, _ = self._checked(rows, int(start), stop)
-                if latest is not None and t.min() < latest - DISORDER:
-                    row = int(start) + int(t.argmin())
-                    self._refuse(rows, row, f"times in order (earlier rows reach {latest:.6f} s; sort them)")
-                latest = float(t.max()) if latest is None else max(latest, float(t.max()))
-                first = float(t.min()) if first is None else min(first, float(t.min()))
-                last = latest
-        assert first is not None
-        assert last is not None
+                begin, seen = max(int(start), seen), min(int(start) + PROBE_LENGTH, count)
+                if begin >= seen:
+                    continue
+                _, _, t, _ = self._checked(rows, begin, seen)
+                if t.min() < last - DISORDER:
+                    expected = f"times in order (earlier rows reach {last:.6f} s; sort the events)"
+                    self._refuse(rows, begin + int(t.argmin()), expected)
+                first, last = float(np.fmin(first, t.min())), float(np.fmax(last, t.max()))
         return first, last
 
 

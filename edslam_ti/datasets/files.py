@@ -65,12 +65,9 @@ def read_depth(path: Path, camera: Camera, metres_per_unit: float) -> np.ndarray
 
     EXR values of 10 km and more are what renderers write for "nothing hit" and become 0.
     """
-    depth = _decode(path, cv2.IMREAD_UNCHANGED)
     if path.suffix.lower() == ".exr":
-        if depth.ndim == 3:  # renderers repeat depth in R, G and B; OpenCV's order is B, G, R
-            depth = depth[..., min(2, depth.shape[2] - 1)]
+        depth = _decode_exr(path)
         _check_size(path, depth, camera, "depth")
-        depth = depth.astype(np.float32)
         bad = ~np.isfinite(depth) | (depth < 0)
         if bad.any():
             v, u = np.argwhere(bad)[0]
@@ -79,6 +76,7 @@ def read_depth(path: Path, camera: Camera, metres_per_unit: float) -> np.ndarray
                 f"column {u}, row {v} ({int(bad.sum())} such pixels)"
             )
         return np.where(depth >= FARTHEST_DEPTH, np.float32(0), depth)
+    depth = _decode(path, cv2.IMREAD_UNCHANGED)
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise DataError(
             f"{path}: expected a 16-bit single-channel depth PNG, got {depth.dtype} of shape {depth.shape}"
@@ -103,6 +101,26 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     if image is None:
         raise DataError(f"{path}: not readable as an image; truncated or not a {path.suffix[1:]} file?")
     return np.asarray(image)
+
+
+def _decode_exr(path: Path) -> np.ndarray:  # [H, W] float32
+    """Return the depth channel of an OpenEXR file (OpenCV's wheels no longer read the format)."""
+    import OpenEXR
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: depth image not found")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
+    except (RuntimeError, ValueError) as error:
+        raise DataError(f"{path}: not readable as OpenEXR ({' '.join(str(error).split())})") from error
+    for wanted in ("Z", "V", "Y", "R"):  # R: renderers that repeat depth in R, G and B
+        for name, pixels in channels.items():
+            if name.split(".")[-1] == wanted:
+                return pixels
+    if len(channels) == 1:
+        return next(iter(channels.values()))
+    raise DataError(f"{path}: expected a channel Z, V, Y or R with depth, got {', '.join(sorted(channels))}")
 
 
 def _check_size(path: Path, image: np.ndarray, camera: Camera, what: str) -> None:
