@@ -3,16 +3,17 @@
 import json
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError, EdSlamError
+from edslam_ti.mapping import GaussianMapper, Mapper
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.output import atomic_file
 from edslam_ti.trajectory import Trajectory, read_tum
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 START, END = "#009E73", "#D55E00"
 MAX_DRAWN_POINTS = 60_000
+MAP_EVERY = 5  # the window fetches the map points at every n-th frame
 
 
 # ---------------------------------------------------------------- trajectories
@@ -172,31 +174,30 @@ def _with_ate(name: str, aligned: AlignedPath) -> str:
 # ---------------------------------------------------------------- renders
 
 
-@dataclass(frozen=True)
-class RenderedView:
-    """What is shown of one view: brightness as displayed, the true image, and depth."""
-
-    name: str  # file name without suffix
-    render: np.ndarray  # [H, W] in [0, 1]
-    truth: np.ndarray | None  # [H, W] in [0, 1]
-    depth: np.ndarray  # [H, W] metres, 0 = nothing
-    caption: str  # time and metrics
-
-
-def write_render_triptychs(folder: Path, views: Iterable[RenderedView]) -> list[Path]:
-    """Write render | truth | depth side by side, one PNG per view, and return their paths."""
+def write_render_triptychs(
+    folder: Path,
+    timestamps: Sequence[float],  # seconds
+    renders: Sequence[np.ndarray],  # [H, W] brightness in [0, 1]
+    truths: Sequence[np.ndarray | None],  # [H, W] brightness in [0, 1]
+    depths: Sequence[np.ndarray],  # [H, W] metres, 0 = nothing drawn
+    captions: Sequence[str] = (),  # metrics to print beside the time
+) -> list[Path]:
+    """Write render | truth | depth side by side, one PNG per view named by its milliseconds."""
+    texts = captions or [""] * len(timestamps)
     paths = []
-    for view in views:
-        paths.append(folder / f"{view.name}.png")
-        _write_triptych(paths[-1], view)
+    for t, render, truth, depth, text in zip(timestamps, renders, truths, depths, texts, strict=True):
+        paths.append(folder / f"{round(1000 * t):06d}.png")
+        _write_triptych(paths[-1], f"t = {t:.3f} s   {text}", render, truth, depth)
     return paths
 
 
-def _write_triptych(path: Path, view: RenderedView) -> None:
-    height, width = view.render.shape
-    for name, image in (("truth", view.truth), ("depth", view.depth)):
-        if image is not None and image.shape != view.render.shape:
-            raise DataError(f"{name}: expected shape {view.render.shape} as the render's, got {image.shape}")
+def _write_triptych(
+    path: Path, caption: str, render: np.ndarray, truth: np.ndarray | None, depth: np.ndarray
+) -> None:
+    height, width = render.shape
+    for name, image in (("truth", truth), ("depth", depth)):
+        if image is not None and image.shape != render.shape:
+            raise DataError(f"{name}: expected shape {render.shape} as the render's, got {image.shape}")
     zoom = max(1, round(320 / width))  # small images are enlarged by a whole number
     w, h, gap, head, foot = width * zoom, height * zoom, 8, 44, 40
     total_w, total_h = 3 * w + 4 * gap, head + h + foot
@@ -216,25 +217,29 @@ def _write_triptych(path: Path, view: RenderedView) -> None:
         "interpolation": "nearest",
         "aspect": "auto",
     }
-    panel(0, "render").imshow(view.render, **grey)
+    panel(0, "render").imshow(render, **grey)
     truth_axes = panel(1, "truth")
-    if view.truth is None:
-        truth_axes.imshow(np.full(view.render.shape, 0.92), **grey)
+    if truth is None:
+        truth_axes.imshow(np.full(render.shape, 0.92), **grey)
         truth_axes.text(0.5, 0.5, "no truth", transform=truth_axes.transAxes, ha="center", color="0.4")
     else:
-        truth_axes.imshow(view.truth, **grey)
-    known = view.depth > 0
-    near, far = np.percentile(view.depth[known], (1, 99)) if known.any() else (0.0, 1.0)
-    depth = np.ma.masked_array(view.depth, ~known)
+        truth_axes.imshow(truth, **grey)
+    known = depth > 0
+    near, far = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     drawn = panel(2, "depth").imshow(
-        depth, cmap="viridis", vmin=near, vmax=max(far, near + 1e-3), interpolation="nearest", aspect="auto"
+        np.ma.masked_array(depth, ~known),
+        cmap="viridis",
+        vmin=near,
+        vmax=max(far, near + 1e-3),
+        interpolation="nearest",
+        aspect="auto",
     )
     left = gap + 2 * (w + gap)
     scale = figure.add_axes(((left + 0.1 * w) / total_w, 24 / total_h, 0.8 * w / total_w, 9 / total_h))
     bar = figure.colorbar(drawn, cax=scale, orientation="horizontal", ticks=list(np.linspace(near, far, 3)))
     bar.ax.set_xticklabels([f"{d:.2f} m" for d in np.linspace(near, far, 3)], fontsize=7)
     bar.ax.tick_params(length=2, pad=2)
-    figure.text(gap / total_w, 1 - 16 / total_h, view.caption, fontsize=9, fontweight="bold")
+    figure.text(gap / total_w, 1 - 16 / total_h, caption, fontsize=9, fontweight="bold")
     _save(figure, path)
 
 
@@ -352,7 +357,7 @@ def _draw_overview(ax: "Axes", runs: Sequence[Result]) -> None:
         pixels[depth < 0.05] = np.nan
         ax.plot(*pixels.T, color=color, linewidth=2)
         for T in run.trajectory.poses[:: max(1, len(run.trajectory) // 6)]:
-            for line in _frustum_lines(T, camera, size=0.08):
+            for line in frustum_lines(T, camera, size=0.08):
                 corners, line_depth = _project(line, camera, T_world_view)
                 if (line_depth > 0.05).all():
                     ax.plot(*corners.T, color=color, linewidth=0.7)
@@ -399,32 +404,10 @@ def _splat_points(
 # ---------------------------------------------------------------- the window
 
 
-class RunViewer(Protocol):
-    """Follows a run."""
-
-    def update(
-        self,
-        trajectory: Trajectory,
-        keyframe_poses: Sequence[np.ndarray],  # [4, 4] each
-        points: np.ndarray,  # [N, 3] metres
-        colors: np.ndarray,  # [N] brightness in [0, 1]
-    ) -> None:
-        """Show the state of the run and return at once."""
-
-    def close(self) -> None:
-        """Take the window away."""
-
-
 class StubViewer:
-    """Shows nothing."""
+    """Shows nothing; the interface of `Viewer`."""
 
-    def update(
-        self,
-        trajectory: Trajectory,
-        keyframe_poses: Sequence[np.ndarray],
-        points: np.ndarray,
-        colors: np.ndarray,
-    ) -> None:
+    def update(self, trajectory: Trajectory, mapper: Mapper | None, camera: Camera) -> None:
         """Do nothing."""
 
     def close(self) -> None:
@@ -437,50 +420,49 @@ def check_display() -> None:
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
         raise EdSlamError(
-            "--visualize: no display found (neither DISPLAY nor WAYLAND_DISPLAY is set); run without it "
-            "and draw the results afterwards: python apps/view.py RESULT --save FILE.png"
+            "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); run without "
+            "--visualize, and draw finished runs with: python apps/view.py RESULT --save FILE.png"
         )
 
 
 class Viewer:
     """An Open3D window that follows a run: trajectory, keyframe frusta and map points."""
 
-    def __init__(self, camera: Camera, title: str = "ED-SLAM") -> None:
+    def __init__(self, title: str = "ED-SLAM") -> None:
         """Open the window, or raise EdSlamError where that is impossible."""
         check_display()
-        self._camera = camera
         self._o3d = o3d = load_open3d()
         self._window = o3d.visualization.Visualizer()
         if not self._window.create_window(window_name=title, width=1280, height=720):
-            raise EdSlamError("--visualize: Open3D could not open a window (no OpenGL?); run without it")
+            raise EdSlamError("Open3D could not open a window (no OpenGL?); run without --visualize")
         self._path = o3d.geometry.LineSet()
         self._frusta = o3d.geometry.LineSet()
         self._cloud = o3d.geometry.PointCloud()
-        self._is_empty = True
+        self._shown: list[Any] = []
+        self._num_updates = 0
 
-    def update(
-        self,
-        trajectory: Trajectory,
-        keyframe_poses: Sequence[np.ndarray],
-        points: np.ndarray,
-        colors: np.ndarray,
-    ) -> None:
-        """Show the state of the run and return at once; a window that was closed stays closed."""
-        if len(trajectory) < 2 or len(points) == 0:
+    def update(self, trajectory: Trajectory, mapper: Mapper | None, camera: Camera) -> None:
+        """Show the state of the run and return at once."""
+        if len(trajectory) < 2:
             return
         fill_lines(self._o3d, self._path, path_lines(trajectory.poses[:, :3, 3]), COLOURS[0])
-        current = [trajectory.poses[-1]]
-        lines = [line for T in [*keyframe_poses, *current] for line in _frustum_lines(T, self._camera)]
-        fill_lines(self._o3d, self._frusta, lines, COLOURS[1])
-        fill_cloud(self._o3d, self._cloud, points, colors)
-        for shape in (self._path, self._frusta, self._cloud):
-            if self._is_empty:
-                self._window.add_geometry(shape, reset_bounding_box=True)
-            else:
+        keyframes = [trajectory.pose(k) for k in _keyframe_indices(mapper, len(trajectory))]
+        frusta = [line for T in [*keyframes, trajectory.pose(-1)] for line in frustum_lines(T, camera)]
+        fill_lines(self._o3d, self._frusta, frusta, COLOURS[1])
+        shapes = [self._path, self._frusta]
+        if mapper is not None and self._num_updates % MAP_EVERY == 0:
+            points, brightness = mapper.points()
+            if len(points):
+                fill_cloud(self._o3d, self._cloud, points, brightness)
+                shapes.append(self._cloud)
+        self._num_updates += 1
+        for shape in shapes:
+            if any(shape is shown for shown in self._shown):
                 self._window.update_geometry(shape)
-        if self._is_empty:
-            self._look_along(trajectory.poses[0])
-        self._is_empty = False
+            else:
+                self._window.add_geometry(shape, reset_bounding_box=True)
+                self._shown.append(shape)
+                self._look_along(trajectory.pose(0))
         self._window.poll_events()
         self._window.update_renderer()
 
@@ -495,15 +477,17 @@ class Viewer:
         control.set_zoom(0.4)
 
 
-def make_viewer(enabled: bool, camera: Camera) -> RunViewer:
-    """Return a window that follows the run, or a viewer that shows nothing."""
-    return Viewer(camera) if enabled else StubViewer()
+def _keyframe_indices(mapper: Mapper | None, num_frames: int) -> list[int]:
+    """Return the frames a map is built on; every tenth for a map without keyframes."""
+    if isinstance(mapper, GaussianMapper):
+        return [keyframe.index for keyframe in mapper.keyframes]
+    return list(range(0, num_frames, 10))
 
 
 def show_results(results: Sequence[Path]) -> None:
     """Show finished runs in an Open3D window until it is closed."""
-    check_display()
     runs = [load_result(folder) for folder in results]
+    check_display()
     o3d = load_open3d()
     shapes: list[Any] = []
     for run, color in zip(runs, _colours()):
@@ -511,7 +495,7 @@ def show_results(results: Sequence[Path]) -> None:
         lines = path_lines(run.trajectory.poses[:, :3, 3])
         every = max(1, len(run.trajectory) // 30)
         camera = Camera(width=4, height=3, fx=3.0, fy=3.0, cx=1.5, cy=1.0)
-        lines += [line for T in run.trajectory.poses[::every] for line in _frustum_lines(T, camera)]
+        lines += [line for T in run.trajectory.poses[::every] for line in frustum_lines(T, camera)]
         fill_lines(o3d, path, lines, color)
         shapes.append(path)
         if run.mesh is not None:
@@ -529,7 +513,7 @@ def path_lines(positions: np.ndarray) -> list[np.ndarray]:  # [F, 3] -> F - 1 li
     return [positions[k : k + 2] for k in range(len(positions) - 1)]
 
 
-def _frustum_lines(T_world_camera: np.ndarray, camera: Camera, size: float = 0.05) -> list[np.ndarray]:
+def frustum_lines(T_world_camera: np.ndarray, camera: Camera, size: float = 0.05) -> list[np.ndarray]:
     """Return the eight edges [2, 3] of a camera's pyramid, `size` metres deep."""
     columns, rows = (-0.5, camera.width - 0.5), (-0.5, camera.height - 0.5)
     corners = np.array(
@@ -588,6 +572,6 @@ def _legend(ax: "Axes") -> None:
     ax.legend(list(unique.values()), list(unique), fontsize=8, framealpha=0.8)
 
 
-def _colours() -> Iterable[str]:
+def _colours() -> Iterator[str]:
     while True:
         yield from COLOURS
