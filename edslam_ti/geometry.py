@@ -26,7 +26,8 @@ def _exp_coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     theta = safe.sqrt()
     t2 = theta_squared
     a = torch.where(small, 1 - t2 / 6 + t2 * t2 / 120, theta.sin() / theta)
-    b = torch.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, (1 - theta.cos()) / safe)
+    # (1 - cos t) as 2 sin^2(t/2), which does not cancel in single precision
+    b = torch.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, 2 * (theta / 2).sin().square() / safe)
     c = torch.where(small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (theta - theta.sin()) / (safe * theta))
     return a, b, c
 

@@ -1,6 +1,7 @@
 """A camera path: key poses over time, interpolated along geodesics (Eq. 9), read and written as TUM."""
 
 import bisect
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +104,9 @@ def read_tum(path: Path) -> Trajectory:
     if not path.is_file():
         raise FileNotFoundError(f"{path} not found")
     try:
-        rows = np.loadtxt(path, comments="#", ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is an error below
+            rows = np.loadtxt(path, comments="#", ndmin=2)
     except ValueError as error:
         raise DataError(f"{path}: expected lines 't tx ty tz qx qy qz qw'; {error}") from error
     if rows.size == 0 or rows.shape[1] != 8:

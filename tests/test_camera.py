@@ -1,0 +1,58 @@
+"""The pinhole camera, with pixel centres at integer coordinates."""
+
+import numpy as np
+import pytest
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError
+
+CAMERA = Camera(width=12, height=8, fx=10.0, fy=11.0, cx=5.25, cy=3.75)
+
+
+def test_rays_project_to_the_pixels_they_come_from() -> None:
+    rays = CAMERA.rays()
+    assert rays.shape == (8, 12, 3)
+    projected = rays @ CAMERA.matrix.T
+    y, x = np.mgrid[0:8, 0:12]
+    np.testing.assert_allclose(projected[..., 0], x, atol=1e-12)
+    np.testing.assert_allclose(projected[..., 1], y, atol=1e-12)
+    np.testing.assert_allclose(projected[..., 2], 1)
+
+
+def test_ray_of_a_downscaled_pixel_is_the_mean_of_its_block() -> None:
+    for factor in (2, 4):
+        rays = CAMERA.rays()
+        blocks = rays.reshape(8 // factor, factor, 12 // factor, factor, 3).mean((1, 3))
+        np.testing.assert_allclose(CAMERA.downscaled(factor).rays(), blocks, atol=1e-12)
+
+
+def test_downscaling_twice_by_two_is_once_by_four() -> None:
+    twice, once = CAMERA.downscaled(2).downscaled(2), CAMERA.downscaled(4)
+    assert twice.shape == once.shape
+    np.testing.assert_allclose(twice.intrinsics, once.intrinsics)
+
+
+def test_odd_edges_are_cut_off() -> None:
+    assert Camera(width=13, height=9, fx=10, fy=10, cx=6, cy=4).downscaled(2).shape == (4, 6)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 0},
+        {"height": -3},
+        {"fx": 0.0},
+        {"fy": -5.0},
+        {"fx": float("nan")},
+        {"cx": float("inf")},
+    ],
+)
+def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
+    values = {"width": 12, "height": 8, "fx": 10.0, "fy": 11.0, "cx": 5.0, "cy": 4.0}
+    with pytest.raises(DataError, match="camera: expected"):
+        Camera(**{**values, **change})
+
+
+def test_downscaling_to_nothing_is_refused() -> None:
+    with pytest.raises(DataError, match="positive size"):
+        CAMERA.downscaled(16)
