@@ -145,3 +145,62 @@ def rasterize(
         (1 - T[:, -1]).view(height, width),
         visible,
     )
+
+
+# --- event simulation ---
+
+
+def hashed_normal(seed: int, pixel: Tensor, k: Tensor) -> Tensor:  # [M], [M] -> [M] float64
+    """Return a standard normal number for (seed, pixel, k): PCG hashes and Box-Muller."""
+    mask = 0xFFFFFFFF
+
+    def pcg(value: Tensor) -> Tensor:
+        state = (value * 747796405 + 2891336453) & mask
+        word = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & mask
+        return (word >> 22) ^ word
+
+    first = pcg(pcg(pcg(torch.full_like(pixel, seed & mask)) ^ pixel) ^ k)
+    second = pcg(first ^ 0x9E3779B9)
+    u1, u2 = (first.double() + 0.5) / 2**32, (second.double() + 0.5) / 2**32
+    return torch.sqrt(-2 * torch.log(u1)) * torch.cos(2 * torch.pi * u2)
+
+
+def simulate_events(
+    log_start: Tensor,  # [H, W]
+    log_end: Tensor,  # [H, W]
+    start: int,  # nanoseconds
+    end: int,  # nanoseconds
+    reference: Tensor,  # [H, W] float64
+    num_crossings: Tensor,  # [H, W] int64
+    last_event: Tensor,  # [H, W] int64, nanoseconds
+    thresholds: tuple[float, float],  # C of brighter and of darker events
+    sigma: float,
+    refractory: int,  # nanoseconds
+    seed: int,
+    min_threshold: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return events [N, 4] int64 (x, y, t, polarity), the new reference and the new crossings [H, W].
+
+    ESIM: each pass over the image lets every pixel cross at most one more level.
+    """
+    L0, L1 = log_start.double(), log_end.double()
+    width = L0.shape[1]
+    pixel = torch.arange(L0.numel()).view(L0.shape)
+    p = torch.sign(L1 - L0)
+    base = torch.where(p > 0, *(torch.full_like(L0, c) for c in thresholds))
+    level, k, last = reference.clone(), num_crossings.clone(), last_event.clone()
+    events = []
+    while True:
+        C = base if sigma == 0 else (base + sigma * hashed_normal(seed, pixel, k)).clamp_min(min_threshold)
+        following = level + p * C
+        crossed = (p != 0) & ((L1 - following) * p >= 0)
+        if not crossed.any():
+            break
+        fraction = ((following - L0) / (L1 - L0)).clamp(0, 1)
+        t = start + torch.where(crossed, (end - start) * fraction + 0.5, torch.zeros_like(fraction)).long()
+        fired = crossed & (t - last >= refractory)
+        events.append(torch.stack([pixel % width, pixel // width, t, p.long()], -1)[fired])
+        level, k, last = torch.where(crossed, following, level), k + crossed, torch.where(fired, t, last)
+    found = torch.cat([torch.empty(0, 4, dtype=torch.int64), *events])
+    rows = sorted(found.tolist(), key=lambda event: (event[2], event[1], event[0]))
+    return torch.tensor(rows, dtype=torch.int64).view(-1, 4), level, k

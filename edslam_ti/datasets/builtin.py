@@ -1,0 +1,41 @@
+"""The built-in sequences: simulated once, kept in the user's cache folder."""
+
+import hashlib
+import os
+from pathlib import Path
+
+from edslam_ti.simulation import HandHeldPath, SimulationConfig, make_room, simulate
+
+GENERATOR_VERSION = 1  # raise it when rooms, paths or rendering change, so that old sequences are remade
+CACHE_VARIABLE = "EDSLAM_CACHE"  # environment variable that overrides the cache folder
+
+
+def cache_folder() -> Path:
+    """Return where generated sequences are kept."""
+    if os.environ.get(CACHE_VARIABLE):
+        return Path(os.environ[CACHE_VARIABLE])
+    import platformdirs
+
+    return Path(platformdirs.user_cache_dir("edslam_ti"))
+
+
+def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) -> Path:
+    """Return the folder of a built-in sequence (EventReplica's layout), simulating it on first use.
+
+    Taichi must have been started. The folder's name holds a hash of the generator's version and of every
+    setting, so changed settings never meet old data.
+    """
+    settings = config or SimulationConfig()
+    key = f"{GENERATOR_VERSION} {settings.model_dump_json()}"
+    version = hashlib.sha256(key.encode()).hexdigest()[:12]
+    folder = cache_folder() / "sequences" / version / scene
+    if folder.is_dir():  # folders appear whole or not at all
+        return folder
+    from rich.progress import Progress
+
+    room = make_room(scene)
+    path = HandHeldPath(room, settings.duration, settings.seed, settings.speed)
+    with Progress(transient=True) as bar:
+        task = bar.add_task(f"simulating {scene} (first use)", total=1.0)
+        simulate(room.scene, path, settings, folder, lambda share: bar.update(task, completed=share))
+    return folder

@@ -1,0 +1,75 @@
+"""What `apps/simulate.py` does: a built-in room or a mesh, a path, and a recording of both."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import kernels
+from edslam_ti.errors import ConfigError
+from edslam_ti.simulation.mesh import load_mesh
+from edslam_ti.simulation.paths import CameraPath, HandHeldPath, RecordedPath, look_at
+from edslam_ti.simulation.recording import RecordingSummary, simulate
+from edslam_ti.simulation.rooms import make_room
+from edslam_ti.simulation.settings import SimulationConfig
+from edslam_ti.trajectory import read_tum
+
+UP_AXES = {
+    "x": (1.0, 0, 0),
+    "-x": (-1.0, 0, 0),
+    "y": (0, 1.0, 0),
+    "-y": (0, -1.0, 0),
+    "z": (0, 0, 1.0),
+    "-z": (0, 0, -1.0),
+}
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a recorded trajectory runs in a scene; without a position it keeps its own coordinates."""
+
+    position: tuple[float, float, float] | None = None  # metres, of the first camera
+    target: tuple[float, float, float] | None = None  # metres, looked at by the first camera
+    up: str = "z"  # the scene's axis that points up
+    scale: float = 1.0  # factor on the motion
+    start: float = 0.0  # seconds skipped
+
+    def first_pose(self) -> np.ndarray | None:  # [4, 4]
+        """Return the first pose, or None where the trajectory's own is kept."""
+        if (self.position is None) != (self.target is None):
+            raise ConfigError("position and look-at: expected both or neither; give the missing one")
+        if self.position is None or self.target is None:
+            return None
+        return look_at(np.array(self.position), np.array(self.target), np.array(UP_AXES[self.up]))
+
+
+def record(
+    scene_name: str | None,
+    mesh: Path | None,
+    mesh_scale: float,
+    trajectory: Path | None,
+    placement: Placement,
+    config: SimulationConfig,
+    out: Path,
+    threads: int = 2,
+    progress: Callable[[float], None] | None = None,
+) -> RecordingSummary:
+    """Start Taichi on the CPU, build the scene and the path, and write the recording."""
+    if (scene_name is None) == (mesh is None):
+        raise ConfigError("expected either a built-in scene or a mesh; give --scene NAME or --mesh FILE")
+    if mesh is not None and trajectory is None:
+        raise ConfigError("mesh: expected a camera path; give --trajectory FILE (TUM format)")
+    kernels.init("cpu", threads=threads)
+    path: CameraPath
+    if trajectory is not None:
+        recorded = read_tum(trajectory)
+        path = RecordedPath(recorded, placement.scale, placement.first_pose(), placement.start)
+    if mesh is not None:
+        scene = load_mesh(mesh, mesh_scale)
+    else:
+        room = make_room(scene_name or "")
+        scene = room.scene
+        if trajectory is None:
+            path = HandHeldPath(room, config.duration, config.seed, config.speed)
+    return simulate(scene, path, config, out, progress)

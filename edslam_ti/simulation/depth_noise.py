@@ -1,0 +1,62 @@
+"""Noise of a structured-light depth camera (Kinect).
+
+Axial noise after Nguyen et al. 2012, quantised disparity after Handa et al. 2014.
+"""
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+
+MIN_DEPTH, MAX_DEPTH = 0.4, 5.0  # metres
+DISPARITY_STEP = 1 / 351.3  # 1/metre: inverse depth is quantised to this (2.8 mm at 1 m, 11 mm at 2 m)
+EDGE_STEP = 0.03  # relative depth step between neighbours from which they form an edge
+LATERAL_DEVIATION = 0.5  # pixels
+DROPOUT = 0.002  # share of pixels lost anywhere
+GRAZING_COSINE = (0.10, 0.25)  # returns are lost below the first, kept above the second
+
+
+def kinect_depth(
+    depth: np.ndarray,  # [H, W] float32 metres, exact, 0 = missing
+    cosine: np.ndarray,  # [H, W] of the angle between viewing ray and surface normal
+    camera: Camera,
+    rng: np.random.Generator,
+) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+    """Return depth as a Kinect would measure it.
+
+    Pixels read a neighbour's depth (lateral jitter), get axial noise of 1.2 mm + 1.9 mm (z - 0.4)^2 and
+    quantised disparity; most pixels at depth edges and at grazing angles are lost, and all beyond 5 m.
+    """
+    height, width = camera.shape
+    v, u = np.mgrid[0:height, 0:width]
+    jitter = rng.normal(0, LATERAL_DEVIATION, (2, height, width))
+    row = np.clip(np.rint(v + jitter[0]), 0, height - 1).astype(int)
+    column = np.clip(np.rint(u + jitter[1]), 0, width - 1).astype(int)
+    edge = _edges(depth)
+    z = np.where(edge, depth[row, column], depth).astype(np.float64)  # surfaces inside keep their pixel
+
+    sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    z = z + sigma * rng.standard_normal(z.shape)
+    inverse = np.rint(1 / np.maximum(z, 1e-3) / DISPARITY_STEP) * DISPARITY_STEP
+    z = 1 / np.maximum(inverse, 1e-3)
+
+    lost = (edge & (rng.random(z.shape) < 0.75)) | (rng.random(z.shape) < DROPOUT)
+    low, high = GRAZING_COSINE
+    lost |= rng.random(z.shape) > (cosine - low) / (high - low)
+    lost |= (depth <= 0) | (z < MIN_DEPTH) | (z > MAX_DEPTH)
+    return np.where(lost, 0, z).astype(np.float32)
+
+
+def _edges(depth: np.ndarray) -> np.ndarray:  # [H, W] bool
+    """Return pixels beside a depth step (both sides of it)."""
+    edge = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        a = depth[:-1] if axis == 0 else depth[:, :-1]
+        b = depth[1:] if axis == 0 else depth[:, 1:]
+        step = np.abs(a - b) > EDGE_STEP * np.minimum(a, b)
+        if axis == 0:
+            edge[:-1] |= step
+            edge[1:] |= step
+        else:
+            edge[:, :-1] |= step
+            edge[:, 1:] |= step
+    return edge

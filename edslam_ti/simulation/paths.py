@@ -1,0 +1,162 @@
+"""Camera paths: hand-held-like motion through a room, and recorded motion placed into a scene."""
+
+import zlib
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.special import erf
+
+from edslam_ti.errors import DataError
+from edslam_ti.simulation.rooms import Room
+from edslam_ti.trajectory import Trajectory
+
+TYPICAL_SPEED = 0.4  # m/s, mean over a long path
+REACH = (0.55, 0.45, 0.22)  # metres, largest excursion along x, y, z
+DWELL = 1.2  # seconds from one sight to the next
+BURST_WIDTH = 0.17  # seconds, Gaussian width of a fast stretch
+MOVE_BURST, GAZE_BURST = 0.9, 2.2  # extra speed in a fast stretch, as a share of the normal speed
+BURST_INTERVAL = (1.7, 2.6)  # seconds from one fast stretch to the next
+
+
+class CameraPath(Protocol):
+    """A pose for every time from 0 to `duration` seconds."""
+
+    duration: float
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera at a time."""
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:  # [4, 4]
+    """Return T_world_camera of a camera at `position` that looks at `target`, upright."""
+    forward = np.asarray(target, np.float64) - position
+    length = np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    if length < 1e-9 or np.linalg.norm(right) < 1e-9 * length:
+        raise DataError(
+            f"camera: cannot look from {position} at {target} with up = {up}; choose another target"
+        )
+    forward = forward / length
+    right = right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    T[:3, 3] = position
+    return T
+
+
+@dataclass(frozen=True)
+class _Waves:
+    """Sums of sinusoids, one row per coordinate."""
+
+    amplitude: np.ndarray  # [D, K]
+    frequency: np.ndarray  # [D, K] Hz
+    phase: np.ndarray  # [D, K]
+
+    def __call__(self, t: float) -> np.ndarray:  # [D]
+        return (self.amplitude * np.sin(2 * np.pi * self.frequency * t + self.phase)).sum(1)
+
+
+class HandHeldPath:
+    """Smooth 6-DoF motion inside a room's free box, looking along its sights.
+
+    Position: slow sinusoids. Gaze: a cubic B-spline through the sights. Both run on a warped clock with
+    fast stretches about every two seconds. Roll and a small tremor of hand (3-9 Hz) run on top.
+    """
+
+    def __init__(self, room: Room, duration: float, seed: int = 0, speed: float = 1.0) -> None:
+        rng = np.random.default_rng([seed, zlib.crc32(room.name.encode())])
+        self.duration = duration
+        self._sights = room.sights
+        half = np.minimum((room.free_high - room.free_low) / 2, REACH)
+        slack = np.maximum((room.free_high - room.free_low) / 2 - half, 0)
+        self._centre = (room.free_low + room.free_high) / 2 + slack * rng.uniform(-0.5, 0.5, 3)
+        weights = np.array([0.55, 0.3, 0.12]) * half[:, None]  # sums to 0.97: stays inside with tremor
+        frequency = np.array([0.16, 0.29, 0.53]) * rng.uniform(0.85, 1.15, (3, 3))
+        phase = rng.uniform(0, 2 * np.pi, (3, 3))
+        slow = _Waves(weights, frequency, phase)
+        # The clock's rate makes the mean speed over a minute the typical one.
+        samples = np.array([slow(t) for t in np.arange(0, 60, 0.02)])
+        mean_speed = np.linalg.norm(np.diff(samples, axis=0), axis=1).mean() / 0.02
+        bursts, start = [], float(rng.uniform(0.9, 1.5))
+        while start < duration * speed + 3:
+            bursts.append(start)
+            start += float(rng.uniform(*BURST_INTERVAL))
+        self._bursts = np.array(bursts)
+        self._speed = speed
+        self._position = _Waves(weights, frequency * TYPICAL_SPEED / mean_speed, phase)
+        self._roll = _Waves(
+            np.array([[4.0, 1.5]]), np.array([[0.31, 0.83]]), rng.uniform(0, 2 * np.pi, (1, 2))
+        )  # degrees
+        tremor = np.array([0.5, 0.3, 0.2]) * np.array([1.2e-3] * 3 + [0.12] * 3)[:, None]  # metres, degrees
+        self._tremor = _Waves(tremor, rng.uniform(3, 9, (6, 3)), rng.uniform(0, 2 * np.pi, (6, 3)))
+        self._first_sight = float(rng.uniform(0, len(self._sights)))
+
+    def _clock(self, t: float, gain: float) -> float:
+        """Return warped time: its rate is 1 + gain exp(-((t - burst)/width)^2), normalised to mean 1."""
+        u = t * self._speed
+        area = gain * BURST_WIDTH * np.sqrt(np.pi)  # seconds gained in one fast stretch
+        bumps = erf((u - self._bursts) / BURST_WIDTH) + erf(self._bursts / BURST_WIDTH)
+        return float((u + area / 2 * bumps.sum()) / (1 + area / np.mean(BURST_INTERVAL)))
+
+    def _target(self, s: float) -> np.ndarray:  # [3]
+        """Return the point looked at: a closed cubic B-spline with the sights as control points."""
+        position = self._first_sight + s / DWELL
+        k, a = int(np.floor(position)), position % 1.0
+        weights = (
+            np.array([(1 - a) ** 3, 3 * a**3 - 6 * a**2 + 4, -3 * a**3 + 3 * a**2 + 3 * a + 1, a**3]) / 6
+        )
+        return weights @ self._sights[(k + np.arange(4)) % len(self._sights)]
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera (z up) at a time in seconds."""
+        tremor = self._tremor(t)
+        position = self._centre + self._position(self._clock(t, MOVE_BURST)) + tremor[:3]
+        s = self._clock(t, GAZE_BURST)
+        T = look_at(position, self._target(s), np.array([0.0, 0.0, 1.0]))
+        roll, pitch, yaw = np.radians(tremor[3:] + (self._roll(s)[0], 0, 0))
+        T[:3, :3] = T[:3, :3] @ _axis_rotation(1, yaw) @ _axis_rotation(0, pitch) @ _axis_rotation(2, roll)
+        return T
+
+
+def _axis_rotation(axis: int, angle: float) -> np.ndarray:  # [3, 3]
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.eye(3)
+    R[i, i] = R[j, j] = np.cos(angle)
+    R[i, j], R[j, i] = -np.sin(angle), np.sin(angle)
+    return R
+
+
+class RecordedPath:
+    """A recorded trajectory, its first time stamp moved to 0."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        scale: float = 1.0,
+        first_pose: np.ndarray | None = None,
+        start: float = 0.0,
+    ) -> None:
+        """Scale positions about the first pose; move the first pose to `first_pose` [4, 4] when given.
+
+        `start` skips seconds of the recording.
+        """
+        stamps = trajectory.timestamps
+        if len(stamps) < 2 or stamps[-1] - stamps[0] <= start:
+            length = stamps[-1] - stamps[0] if len(stamps) else 0.0
+            raise DataError(
+                f"trajectory: expected more than {start:g} s of motion, got {length:g} s; "
+                "use a longer trajectory or another start"
+            )
+        if scale <= 0:
+            raise DataError(f"trajectory scale: expected a positive factor, got {scale:g}")
+        origin = trajectory.at(stamps[0] + start)
+        motion = np.linalg.inv(origin) @ trajectory.poses  # [F, 4, 4]
+        motion[:, :3, 3] *= scale
+        placed = (origin if first_pose is None else first_pose) @ motion
+        self._trajectory = Trajectory(stamps - stamps[0] - start, placed)
+        self.duration = float(stamps[-1] - stamps[0] - start)
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera at a time in seconds."""
+        return self._trajectory.at(t)

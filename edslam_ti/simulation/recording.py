@@ -1,0 +1,302 @@
+"""A scene and a camera path become a recording on disk in EventReplica's layout.
+
+poses_ts.txt, traj.txt          time (s) and camera-to-world pose (16 numbers, OpenCV axes) of every image
+images/frameNNNNNN.png          grey, 8 bit; NNNNNN = milliseconds
+depth/frameNNNNNN.png           uint16, 5000 units per metre, 0 = missing
+event_threshold_C/gray_events_data.npy    [N, 4] float64: x, y, t (s), polarity -1/+1, sorted by time
+camera.json, README.txt         intrinsics and settings; what this is
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError
+from edslam_ti.output import atomic_folder
+from edslam_ti.simulation.depth_noise import kinect_depth
+from edslam_ti.simulation.paths import CameraPath
+from edslam_ti.simulation.renderer import Render, Renderer
+from edslam_ti.simulation.scene import Scene
+from edslam_ti.simulation.settings import SimulationConfig
+from kernels.event_simulation import EventArrays, EventSensorState, simulate_events
+
+DEPTH_UNITS_PER_METRE = 5000  # of the depth PNG; reaches to 13.1 m
+MILLISECOND = 1_000_000  # nanoseconds
+HEADER_BYTES = 128  # of the event file
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """What was written."""
+
+    folder: Path
+    num_events: int
+    num_rendered_frames: int
+    num_images: int
+    num_depth_images: int
+    duration: float  # seconds
+
+
+def simulate(
+    scene: Scene,
+    path: CameraPath,
+    config: SimulationConfig,
+    out: Path,
+    progress: Callable[[float], None] | None = None,
+) -> RecordingSummary:
+    """Write the recording to the folder `out`, replacing it; Taichi must have been started.
+
+    Frames are rendered so that nothing moves more than `config.max_motion` pixels between two of them,
+    and at every image and depth time. `progress` receives the share done, 0 to 1.
+    """
+    duration = min(config.duration, path.duration)
+    image_times = _millisecond_times(config.image_rate, duration)
+    depth_times = _millisecond_times(config.depth_rate, duration)
+    if min(len(image_times), len(depth_times)) < 2:
+        raise DataError(
+            f"recording of {duration:g} s: expected at least two images and two depth images; "
+            "use a longer duration or trajectory, or higher rates"
+        )
+    end = round(duration * 1e9)
+    renderer = Renderer(scene, config.camera, config.samples_per_pixel)
+    times = _FrameTimes(config, path, sorted({*image_times, *depth_times, end}))
+    with atomic_folder(out) as folder:
+        for name in ("images", "depth"):
+            (folder / name).mkdir()
+        threshold = folder / f"event_threshold_{config.contrast_threshold:g}"
+        threshold.mkdir()
+        images = _ImageWriter(folder / "images", image_times, config.exposure)
+        depths = _DepthWriter(folder / "depth", set(depth_times), config)
+        now, num_frames = 0, 1
+        render = renderer.render(path.pose(0.0))
+        log_now = _log_intensity(render, config)
+        state = EventSensorState.start(log_now)
+        depths.add(now, render)
+        with EventFileWriter(threshold / "gray_events_data.npy") as events:
+            while now < end:
+                following = times.after(now, render.depth)
+                render_next = renderer.render(path.pose(following / 1e9))
+                log_next = _log_intensity(render_next, config)
+                events.append(
+                    simulate_events(
+                        log_now,
+                        log_next,
+                        now,
+                        following,
+                        state,
+                        config.contrast_threshold,
+                        config.negative_contrast_threshold or config.contrast_threshold,
+                        config.threshold_noise,
+                        round(config.refractory_period * 1e9),
+                        config.seed,
+                    )
+                )
+                images.add(now, render.grey, following, render_next.grey)
+                depths.add(following, render_next)
+                now, render, log_now = following, render_next, log_next
+                num_frames += 1
+                if progress:
+                    progress(now / end)
+            images.finish()
+        _write_poses(folder, path, image_times)
+        _write_descriptions(folder, scene, config)
+    return RecordingSummary(out, events.count, num_frames, len(image_times), len(depth_times), duration)
+
+
+def _log_intensity(render: Render, config: SimulationConfig) -> np.ndarray:  # [H, W] float32
+    return np.log(render.grey + np.float32(config.log_epsilon))
+
+
+def _millisecond_times(rate: float, duration: float) -> list[int]:
+    """Return times k / rate up to the duration, rounded to whole milliseconds, in nanoseconds."""
+    count = int(np.floor(duration * rate + 1e-6)) + 1
+    stamps = [round(1e3 * k / rate) * MILLISECOND for k in range(count)]
+    return sorted({t for t in stamps if t <= round(duration * 1e9)})
+
+
+class _FrameTimes:
+    """Chooses when to render next, in nanoseconds."""
+
+    def __init__(self, config: SimulationConfig, path: CameraPath, required: list[int]) -> None:
+        self._camera = config.camera
+        self._path = path
+        self._max_motion = config.max_motion
+        self._longest = round(1e9 / config.min_frame_rate)
+        self._required = np.array(required)
+        self._step = self._longest
+
+    def after(self, now: int, depth: np.ndarray) -> int:
+        """Return the next frame's time: within `max_motion` pixels, never beyond a required time."""
+        step = min(self._longest, round(1.5 * self._step))
+        for _ in range(4):
+            motion = self._motion(now, now + step, depth)
+            if motion <= 1.02 * self._max_motion:
+                break
+            step = max(round(step * 0.98 * self._max_motion / motion), 20_000)
+        self._step = step
+        left = int(self._required[np.searchsorted(self._required, now, side="right")]) - now
+        pieces = int(np.ceil(left / step))
+        return now + left if pieces <= 1 else now + min(step, round(left / pieces))
+
+    def _motion(self, start: int, end: int, depth: np.ndarray) -> float:
+        """Return the 95th percentile of the image motion (pixels) of points visible at `start`."""
+        camera = self._camera
+        rows = np.linspace(0, camera.height - 1, 15).astype(int)
+        columns = np.linspace(0, camera.width - 1, 21).astype(int)
+        v, u = (a.ravel() for a in np.meshgrid(rows, columns, indexing="ij"))
+        z = depth[v, u].astype(np.float64)
+        v, u, z = v[z > 0], u[z > 0], z[z > 0]
+        if len(z) == 0:
+            return 0.0
+        points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
+        T = np.linalg.inv(self._path.pose(end / 1e9)) @ self._path.pose(start / 1e9)
+        moved = points @ T[:3, :3].T + T[:3, 3]
+        ahead = np.maximum(moved[:, 2], 0.05)
+        du = camera.fx * moved[:, 0] / ahead + camera.cx - u
+        dv = camera.fy * moved[:, 1] / ahead + camera.cy - v
+        return float(np.percentile(np.hypot(du, dv), 95))
+
+
+class EventFileWriter:
+    """Appends events to an .npy file [N, 4] float64 whose length is filled in at the end."""
+
+    def __init__(self, path: Path) -> None:
+        self.count = 0
+        self._file = path.open("wb")
+        self._file.write(b"\0" * HEADER_BYTES)
+
+    def append(self, events: EventArrays) -> None:
+        """Write events as rows x, y, t (s), polarity."""
+        rows = np.empty((len(events.t), 4))
+        rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = events.x, events.y, events.t / 1e9, events.polarity
+        self._file.write(rows.tobytes())
+        self.count += len(rows)
+
+    def __enter__(self) -> "EventFileWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({self.count}, 4), }}"
+        prefix = np.lib.format.magic(1, 0) + (HEADER_BYTES - 10).to_bytes(2, "little")
+        self._file.seek(0)
+        self._file.write(prefix + text.ljust(HEADER_BYTES - 11).encode("latin1") + b"\n")
+        self._file.close()
+
+
+@dataclass
+class _ImageWriter:
+    """Writes images at their times, each the mean brightness over its exposure."""
+
+    folder: Path
+    times: list[int]  # nanoseconds
+    exposure: float  # seconds
+    _sums: dict[int, np.ndarray] = field(default_factory=dict)  # image time -> integral over ns
+    _spans: dict[int, int] = field(default_factory=dict)
+    _next: int = 0
+
+    def add(self, start: int, grey_start: np.ndarray, end: int, grey_end: np.ndarray) -> None:
+        """Take in the brightness of the interval [start, end], linear in time."""
+        half = round(self.exposure * 0.5e9)
+        while self._next < len(self.times) and self.times[self._next] - half <= end:
+            t = self.times[self._next]
+            if half == 0:
+                self._write(t, grey_end if t == end else grey_start)
+            else:
+                self._sums[t], self._spans[t] = np.zeros(grey_start.shape), 0
+            self._next += 1
+        for t in list(self._sums):
+            low, high = max(start, t - half), min(end, t + half)
+            if high > low:
+                middle = ((low + high) / 2 - start) / (end - start)
+                self._sums[t] += (high - low) * ((1 - middle) * grey_start + middle * grey_end)
+                self._spans[t] += high - low
+            if end >= t + half:
+                self._finish(t)
+
+    def finish(self) -> None:
+        """Write images whose exposure the recording cuts off."""
+        for t in list(self._sums):
+            self._finish(t)
+
+    def _finish(self, t: int) -> None:
+        self._write(t, self._sums.pop(t) / self._spans.pop(t))
+
+    def _write(self, t: int, grey: np.ndarray) -> None:
+        _write_png(self.folder / _frame_name(t), np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8))
+
+
+@dataclass
+class _DepthWriter:
+    """Writes depth images at their times, with noise when asked for."""
+
+    folder: Path
+    times: set[int]  # nanoseconds
+    config: SimulationConfig
+
+    def add(self, t: int, render: Render) -> None:
+        """Write the depth of a frame if its time is one of a depth image."""
+        if t not in self.times:
+            return
+        depth = render.depth
+        if self.config.depth_noise == "kinect":
+            rng = np.random.default_rng([self.config.seed, t // MILLISECOND])
+            depth = kinect_depth(depth, render.cosine, self.config.camera, rng)
+        units = np.rint(depth.astype(np.float64) * DEPTH_UNITS_PER_METRE)
+        units[units > np.iinfo(np.uint16).max] = 0
+        _write_png(self.folder / _frame_name(t), units.astype(np.uint16))
+
+
+def _frame_name(t: int) -> str:
+    return f"frame{t // MILLISECOND:06d}.png"
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    import cv2
+
+    if not cv2.imwrite(str(path), image):
+        raise DataError(f"{path}: could not be written; is the disk full?")
+
+
+def _write_poses(folder: Path, path: CameraPath, times: list[int]) -> None:
+    """Write one time and one pose per image."""
+    with (folder / "poses_ts.txt").open("w") as stamps, (folder / "traj.txt").open("w") as poses:
+        for t in times:
+            stamps.write(f"{t / 1e9:.6f}\n")
+            poses.write(" ".join(f"{value:.12g}" for value in path.pose(t / 1e9).ravel()) + "\n")
+
+
+def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) -> None:
+    """Write camera.json and README.txt."""
+    camera: Camera = config.camera
+    values = {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "pixel_centres": "integer",
+        "contrast_threshold": config.contrast_threshold,
+        "depth_scale": DEPTH_UNITS_PER_METRE,
+        "description": scene.description,
+    }
+    (folder / "camera.json").write_text(json.dumps(values, indent=2) + "\n")
+    settings = "\n".join(f"  {key}: {value}" for key, value in config.model_dump().items())
+    (folder / "README.txt").write_text(
+        f"Simulated recording: {scene.description}.\n\n"
+        "poses_ts.txt, traj.txt: seconds and camera-to-world pose (16 numbers, row-major; x right, y down,\n"
+        "z forward) of every image. images/: 8-bit grey. depth/: uint16, "
+        f"{DEPTH_UNITS_PER_METRE} units per metre, 0 = missing.\n"
+        "File names are milliseconds; depth may be at other times than the poses.\n"
+        "gray_events_data.npy: float64 rows x, y, t (s), polarity -1/+1, sorted by time; a change of\n"
+        f"log(grey + {config.log_epsilon:.6g}) by the contrast threshold fires an event, grey in [0, 1].\n"
+        "Pixel centres are at integer coordinates.\n\n"
+        f"Settings:\n{settings}\n"
+    )

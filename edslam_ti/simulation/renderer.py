@@ -1,0 +1,90 @@
+"""Grey image and exact depth of a scene from any pose, by ray casting.
+
+One ray per pixel centre gives depth and, through a filtered texture look-up, brightness; pixels beside
+which another surface begins are cast again with several rays (anti-aliasing where it is needed).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.simulation.scene import Scene
+from kernels.texture import mark_edges, pixel_rays, shade, write_sample_means
+
+EDGE_CONTRAST = 0.01  # Michelson contrast between neighbouring surfaces from which an edge is refined
+
+
+@dataclass(frozen=True)
+class Render:
+    """What a camera sees from one pose."""
+
+    grey: np.ndarray  # [H, W] float32 in [0, 1]
+    depth: np.ndarray  # [H, W] float32 metres along the optical axis at pixel centres, 0: nothing hit
+    cosine: np.ndarray  # [H, W] float32, of the angle between the viewing ray and the surface normal
+
+
+class Renderer:
+    """Ray caster of one scene and one camera."""
+
+    def __init__(
+        self, scene: Scene, camera: Camera, samples_per_edge_pixel: int = 8, background: float = 0.5
+    ) -> None:
+        o3d = load_open3d()
+        self._tensor = o3d.core.Tensor
+        self.camera = camera
+        self.background = background
+        self._rays = o3d.t.geometry.RaycastingScene()
+        self._rays.add_triangles(self._tensor(scene.vertices), self._tensor(scene.triangles))
+        self._triangles = scene.triangle_table()
+        self._textures = scene.texture_table()
+        self._pixels = np.arange(camera.width * camera.height, dtype=np.int32)
+        self._centre = np.zeros((1, 2), np.float32)
+        self._offsets = _sample_offsets(samples_per_edge_pixel)
+
+    def render(self, T_world_camera: np.ndarray) -> Render:  # [4, 4]
+        """Return image and depth from a pose; pixel centres at integer coordinates."""
+        shape = self.camera.shape
+        rays, hit, grey, surface = self._cast(T_world_camera, self._pixels, self._centre, 1.0)
+        edges = mark_edges(grey.reshape(shape), surface.reshape(shape), EDGE_CONTRAST)
+        refine = np.flatnonzero(edges).astype(np.int32)
+        if len(refine) and len(self._offsets) > 1:
+            scale = 1.0 / np.sqrt(len(self._offsets))
+            _, _, samples, _ = self._cast(T_world_camera, refine, self._offsets, scale)
+            write_sample_means(samples.reshape(len(refine), -1), refine, grey)
+        distance = hit["t_hit"].numpy()
+        depth = np.where(np.isfinite(distance), distance, 0).astype(np.float32)
+        direction = rays[:, 3:]
+        normal = hit["primitive_normals"].numpy()
+        cosine = np.abs((direction * normal).sum(1)) / np.linalg.norm(direction, axis=1)
+        return Render(grey.reshape(shape), depth.reshape(shape), cosine.reshape(shape))
+
+    def _cast(  # type: ignore[no-untyped-def]
+        self, T_world_camera: np.ndarray, pixels: np.ndarray, offsets: np.ndarray, scale: float
+    ):
+        """Return rays, hits, grey and surface of len(pixels) * len(offsets) rays."""
+        rays = pixel_rays(T_world_camera, self.camera.intrinsics, self.camera.width, pixels, offsets)
+        hit = self._rays.cast_rays(self._tensor(rays))
+        R = T_world_camera[:3, :3]
+        steps = np.stack([R[:, 0] / self.camera.fx, R[:, 1] / self.camera.fy]) * scale
+        grey, surface = shade(
+            rays,
+            hit["t_hit"].numpy(),
+            hit["primitive_ids"].numpy(),
+            hit["primitive_uvs"].numpy(),
+            steps,
+            self._triangles,
+            self._textures,
+            self.background,
+        )
+        return rays, hit, grey, surface
+
+
+def _sample_offsets(count: int) -> np.ndarray:  # [S, 2] float32
+    """Return sub-pixel positions, one in each of `count` rows and columns (n-rooks)."""
+    steps = {1: 1, 2: 1, 3: 1, 4: 2, 5: 2, 6: 5, 7: 3, 8: 3, 9: 4}.get(count, 5)
+    while np.gcd(steps, count) != 1:
+        steps += 1
+    k = np.arange(count)
+    return (np.stack([k + 0.5, (k * steps) % count + 0.5], 1) / count - 0.5).astype(np.float32)

@@ -1,0 +1,65 @@
+"""Settings of a simulated recording."""
+
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from edslam_ti.camera import Camera
+from edslam_ti.config import Stage
+from edslam_ti.errors import ConfigError
+
+
+class SimulationConfig(Stage):
+    """Camera, event sensor, depth sensor and timing of a simulated recording."""
+
+    width: int = Field(384, ge=8, le=4096)
+    """Image width in pixels."""
+    height: int = Field(240, ge=8, le=4096)
+    """Image height in pixels."""
+    focal_length: float | None = Field(None, gt=0)
+    """fx = fy in pixels; omitted: half the width (90 degrees, as EventReplica)."""
+    duration: float = Field(2.5, gt=0)
+    """Length of the recording in seconds."""
+    contrast_threshold: float = Field(0.1, ge=0.01)
+    """C: change of log intensity that fires an event (EventReplica's)."""
+    negative_contrast_threshold: float | None = Field(None, ge=0.01)
+    """C of darker events; omitted: the same."""
+    threshold_noise: float = Field(0.0, ge=0)
+    """Standard deviation of the threshold of each event (ESIM: 0.021)."""
+    refractory_period: float = Field(0.0, ge=0, lt=1)
+    """Seconds after an event in which its pixel stays silent."""
+    log_epsilon: float = Field(1 / 255, gt=0)
+    """Added to the grey value in [0, 1] before the logarithm."""
+    depth_rate: float = Field(20.0, gt=0, le=1000)
+    """Depth images per second; their times are rounded to whole milliseconds."""
+    image_rate: float = Field(20.0, gt=0, le=1000)
+    """Grey images and written poses per second; their times are rounded to whole milliseconds."""
+    depth_noise: Literal["none", "kinect"] = "none"
+    """kinect: axial noise, quantised disparity, jittered and missing edges, nothing beyond 5 m."""
+    exposure: float = Field(0.0, ge=0, lt=1)
+    """Seconds over which an image integrates, centred on its time (motion blur); 0: sharp."""
+    samples_per_pixel: int = Field(8, ge=1, le=64)
+    """Rays of a pixel that shows an edge; others take one ray and a texture look-up filtered to its size."""
+    max_motion: float = Field(1.0, gt=0, le=8)
+    """Pixels a scene point may move between rendered frames; in between, log intensity is linear."""
+    min_frame_rate: float = Field(100.0, gt=0)
+    """Rendered frames per second at least (Hz), however slow the motion."""
+    speed: float = Field(1.0, gt=0, le=10)
+    """Factor on the speed of the built-in path (1: about 0.4 m/s)."""
+    seed: int = Field(0, ge=0)
+    """Seed of path, threshold noise and depth noise."""
+
+    def __init__(self, **values: Any) -> None:
+        """Check the values; the first that cannot be used raises `ConfigError`."""
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            name = ".".join(str(part) for part in problem["loc"])
+            raise ConfigError(f"{name}: {problem['msg']}, got {problem['input']!r}") from error
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera, principal point in the middle of the image."""
+        f = self.focal_length or 0.5 * self.width
+        return Camera(self.width, self.height, f, f, (self.width - 1) / 2, (self.height - 1) / 2)
