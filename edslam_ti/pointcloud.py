@@ -62,21 +62,6 @@ def nearest_neighbour_scales(
     return np.maximum(distances.mean(1), SMALLEST_SCALE)
 
 
-def surface_normals(
-    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
-    camera: Camera,
-) -> np.ndarray:  # [H, W, 3] float32 unit vectors, camera frame
-    """Return the normal at every pixel, towards the camera; zero where a neighbour's depth is missing."""
-    _check_image("depth", depth, camera)
-    o3d = load_open3d()
-    valid = (depth > 0) & (depth < FARTHEST)
-    image = o3d.t.geometry.Image(np.ascontiguousarray(np.where(valid, depth, 0), np.float32))
-    vertices = image.create_vertex_map(o3d.core.Tensor(camera.matrix), 0.0)  # [H, W, 3]
-    normals = vertices.create_normal_map(0.0).as_tensor().numpy().copy()
-    facing_away = (normals * vertices.as_tensor().numpy()).sum(-1, keepdims=True) > 0
-    return np.where(facing_away, -normals, normals)
-
-
 def _check_image(name: str, image: np.ndarray, camera: Camera) -> None:
     if image.shape != camera.shape:
         raise DataError(f"{name}: expected shape {camera.shape} as the camera's, got {image.shape}")

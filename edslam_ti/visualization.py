@@ -331,12 +331,13 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
 
 def _draw_points(ax: "Axes", runs: Sequence[Result], view: _PlanarView) -> None:
     """Draw the map points of every run that has some, in their brightness."""
+    ax.set_facecolor("#dfe5ec")  # bright points show, too
     for run in runs:
         if run.points is None or run.brightness is None:
             continue
         chosen = np.linspace(0, len(run.points) - 1, min(len(run.points), MAX_DRAWN_POINTS)).astype(int)
         x, y = view.project(run.points[chosen]).T
-        ax.scatter(x, y, 0.3, run.brightness[chosen], cmap="gray", vmin=0, vmax=1, alpha=0.5, linewidths=0)
+        ax.scatter(x, y, 0.8, run.brightness[chosen], cmap="gray", vmin=0, vmax=1, alpha=0.6, linewidths=0)
 
 
 def _draw_overview(ax: "Axes", runs: Sequence[Result]) -> None:

@@ -1,11 +1,11 @@
-"""Depth to points, spacing and normals."""
+"""Depth to points, and their spacing."""
 
 import numpy as np
 import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.pointcloud import SMALLEST_SCALE, depth_to_points, nearest_neighbour_scales, surface_normals
+from edslam_ti.pointcloud import SMALLEST_SCALE, depth_to_points, nearest_neighbour_scales
 
 CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
 
@@ -85,12 +85,3 @@ def test_coinciding_points_keep_a_positive_scale() -> None:
 def test_a_single_point_has_no_spacing() -> None:
     with pytest.raises(DataError, match="at least 2"):
         nearest_neighbour_scales(np.zeros((1, 3)))
-
-
-def test_normals_of_a_plane_are_its_normal_towards_the_camera() -> None:
-    camera = Camera(width=40, height=30, fx=35.0, fy=35.0, cx=19.0, cy=15.5)
-    normal = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
-    depth = (-1.5 / (camera.rays() @ normal)).astype(np.float32)
-    normals = surface_normals(depth, camera)
-    np.testing.assert_allclose(normals[:-1, :-1], np.broadcast_to(normal, (29, 39, 3)), atol=1e-3)
-    assert not normals[-1].any()  # the last row has no neighbour below
