@@ -40,7 +40,7 @@ class TrackingConfig(Stage):
     """Patch centres are drawn where the surface exceeds this (tau in Sec. III-B; not given there)."""
     max_depth_difference: float = Field(0.1, gt=0)
     """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
-    references: Literal["previous", "keyframe", "both"] = "both"
+    references: Literal["previous", "keyframe", "both"] = "keyframe"
     """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
     surface_sigma: float = Field(0.15, gt=0)
     """Standard deviation of a time-surface residual."""
@@ -115,7 +115,7 @@ class MappingConfig(Stage):
     """Added to brightness before the logarithm of Eq. 10."""
     background: float = Field(0.5, gt=0, lt=1)
     """Brightness where nothing is drawn; also of new Gaussians without neighbours."""
-    means_rate: float = Field(2e-4, gt=0)
+    means_rate: float = Field(5e-4, gt=0)
     """Adam's learning rate of the means, metres."""
     quats_rate: float = Field(1e-3, gt=0)
     """Adam's learning rate of the quaternions (gsplat)."""
@@ -125,6 +125,11 @@ class MappingConfig(Stage):
     """Adam's learning rate of the opacity logits."""
     colors_rate: float = Field(3e-2, gt=0)
     """Adam's learning rate of the brightness logits."""
+    brightness_cells: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.8)
+    """Edge lengths in metres of cells whose Gaussians share a brightness offset. Events tie brightness
+    only across edges, so that large surfaces converge slowly one Gaussian at a time."""
+    cells_rate: float = Field(2e-2, gt=0)
+    """Adam's learning rate of the cells' brightness offsets."""
     bundle_adjustment: bool = True
     """Optimise the frames' poses together with the map."""
     poses_rate: float = Field(1e-4, gt=0)

@@ -10,6 +10,9 @@ from edslam_ti.config import MappingConfig
 # Raw parameters and their widths; the names carry the parametrisation.
 PARAMETERS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 0, "logit_colors": 1}
 
+CELL_TABLE = 1 << 14  # entries a level; distant cells may share one, which only slows convergence
+CELL_PRIMES = (73856093, 19349663, 83492791)  # Teschner et al. 2003, spatial hashing
+
 
 class GaussianMap:
     """N Gaussians as raw (unbounded) parameters: means [N, 3] in metres (world), quats [N, 4] wxyz,
@@ -27,6 +30,11 @@ class GaussianMap:
         }
         self._raw: dict[str, Tensor] = {}
         self._adam = torch.optim.Adam([torch.empty(0)])
+        self._cell_sizes = torch.tensor(config.brightness_cells)
+        self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
+        self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
+        self._cell_adam = torch.optim.Adam([self._cell_table], lr=config.cells_rate, eps=1e-15)
+        self._cell_rate = config.cells_rate
         self._replace(empty, moments=None)
 
     def __len__(self) -> int:
@@ -55,7 +63,8 @@ class GaussianMap:
 
     @property
     def colors(self) -> Tensor:  # [N, 1] brightness in (0, 1)
-        return self._raw["logit_colors"].sigmoid()
+        shared = self._cell_table[self._cells].sum(-1, keepdim=True)
+        return (self._raw["logit_colors"] + shared).sigmoid()
 
     def add(
         self,
@@ -66,12 +75,15 @@ class GaussianMap:
     ) -> None:
         """Append Gaussians; their optimiser moments start at zero."""
         m = len(means)
+        cells = self._cells_of(means)
+        shared = self._cell_table.detach()[cells].sum(-1, keepdim=True)
+        self._cells = torch.cat([self._cells, cells])
         new = {
             "means": means,
             "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(m, 1),
             "log_scales": scales.log(),
             "logit_opacities": torch.full((m,), opacity).logit(),
-            "logit_colors": colors.clamp(0.02, 0.98).logit(),
+            "logit_colors": colors.clamp(0.001, 0.999).logit() - shared,
         }
         moments = {
             name: {key: torch.cat([value, torch.zeros_like(new[name])]) for key, value in state.items()}
@@ -82,6 +94,7 @@ class GaussianMap:
 
     def keep(self, mask: Tensor) -> None:
         """Keep the Gaussians where mask [N] is true."""
+        self._cells = self._cells[mask]
         moments = {
             name: {key: value[mask] for key, value in state.items()}
             for name, state in self._moments().items()
@@ -92,12 +105,21 @@ class GaussianMap:
         """Take one Adam step along the gradients, and clear them."""
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
+        self._cell_adam.step()
+        self._cell_adam.zero_grad(set_to_none=True)
         self._steps += 1
 
     def decay_rates(self, factor: float) -> None:
         """Set every learning rate to `factor` times its configured value."""
         for group in self._adam.param_groups:
             group["lr"] = self._rates[group["name"]] * factor
+        self._cell_adam.param_groups[0]["lr"] = self._cell_rate * factor
+
+    def _cells_of(self, means: Tensor) -> Tensor:  # [M, 3] -> [M, L]
+        """Return the entry of the brightness table that each mean shares at every cell size."""
+        grid = torch.floor(means[:, None, :] / self._cell_sizes[:, None]).long()  # [M, L, 3]
+        hashed = (grid * torch.tensor(CELL_PRIMES)).sum(-1) % CELL_TABLE
+        return hashed + CELL_TABLE * torch.arange(len(self._cell_sizes))
 
     def _moments(self) -> dict[str, dict[str, Tensor]]:
         """Return Adam's first and second moments by parameter; zeros before the first step."""

@@ -19,7 +19,7 @@ from edslam_ti.pointcloud import depth_to_points
 from edslam_ti.rendering import RenderOutput, View, render, render_view
 from edslam_ti.trajectory import Trajectory
 
-Progress = Callable[[float], None]  # called with the fraction done, 0 to 1
+Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
 
 MIN_CHUNKS = 3  # events of so many chunks are needed before the map's brightness can be optimised
 HELD_OUT_MARGIN = 0.15  # fraction of a chunk around a held-out time where no interval may begin or end
@@ -140,7 +140,8 @@ class GaussianMapper:
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
             self._optimise(trajectory, newest_share=0.0)
-            progress((k + 1) / steps)
+            if not progress((k + 1) / steps):
+                break
         self._prune()
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:

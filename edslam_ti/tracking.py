@@ -1,7 +1,7 @@
 """Bidirectional patch alignment of time surfaces and depth (Sec. III-B, Eq. 2-5)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from kernels.patch_warp import NormalEquations, Patches, ResidualModel, extract_
 
 MIN_PIXELS = 200  # fewer residuals than this constrain no pose
 MAX_CONDITION = 1e7  # of the normal equations: beyond, some motion is not observed
-SMALL_STEP = 1e-6  # metres and radians: converged
+SMALL_GAIN = 1e-4  # relative decrease of the cost: converged
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class _Reference:
 
     frame: Frame
     patches: list[Patches]
+    has_surface: bool  # False: too few events yet, only its depth can be aligned
 
 
 @dataclass(frozen=True)
@@ -79,16 +80,18 @@ class BidirectionalPatchTracker:
             depth_sigma_2=config.depth_sigma_2,
             huber_threshold=config.huber_threshold,
         )
+        self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame` relative to the references' poses on the trajectory."""
-        current = _Reference(frame, self._draw_patches(frame))
+        current = self._with_patches(frame)
+        can_be_reference = frame.depth is not None and (current.has_surface or self._model.depth_weight > 0)
         if self._keyframe is None:
-            if frame.depth is not None:
+            if can_be_reference:
                 self._keyframe = self._previous = current
             return TrackingResult(guess, True, 1.0)
         result, overlap = self._track(current, guess, trajectory)
-        if frame.depth is not None:
+        if can_be_reference:
             if overlap < self._config.min_overlap or not result.converged:
                 self._keyframe = current
             self._previous = current
@@ -160,9 +163,10 @@ class BidirectionalPatchTracker:
             step = -np.linalg.solve(H, system.g)
             candidate_T = T @ se3_exp(torch.from_numpy(step)).numpy()
             candidate = self._system(current, references, candidate_T, level)
-            if _mean_cost(candidate) < _mean_cost(system):
+            gain = 1 - _mean_cost(candidate) / _mean_cost(system)
+            if gain > 0:
                 T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
-                if np.abs(step).max() < SMALL_STEP * 2**level * 10:
+                if gain < SMALL_GAIN:
                     break
             else:
                 damping *= 8
@@ -185,15 +189,16 @@ class BidirectionalPatchTracker:
             T_reference_camera = np.linalg.inv(T_world_reference) @ T_world_camera
             T_camera_reference = np.linalg.inv(T_reference_camera)
             intrinsics = now.camera.intrinsics
+            model = self._model if reference.has_surface and current.has_surface else self._depth_only
             # source <- target and target <- source: both directions of Eq. 5
             system = normal_equations(
                 reference.patches[level], now.surface, now.depth, T_camera_reference, intrinsics,
-                self._model, inverse=True,
+                model, inverse=True,
             )  # fmt: skip
             if current.frame.depth is not None:
                 system += normal_equations(
                     current.patches[level], then.surface, then.depth, T_reference_camera, intrinsics,
-                    self._model,
+                    model,
                 )  # fmt: skip
             # The twist acts on the reference's side; exp(xi_r) T = T exp(Ad(T^-1) xi_r).
             A = adjoint(T_reference_camera)
@@ -205,11 +210,17 @@ class BidirectionalPatchTracker:
         assert total is not None
         return total
 
-    def _draw_patches(self, frame: Frame) -> list[Patches]:
-        """Draw patches where the time surface exceeds its threshold and depth is known."""
+    def _with_patches(self, frame: Frame) -> _Reference:
+        """Draw patches where the time surface exceeds its threshold and depth is known.
+
+        Before the first events there is no surface: then they are drawn where there is depth.
+        """
         config = self._config
         finest = frame.level(0)
-        rows, columns = np.nonzero((finest.surface > config.min_time_surface) & (finest.depth > 0))
+        has_depth = finest.depth > 0
+        on_surface = has_depth & (finest.surface > config.min_time_surface)
+        has_surface = np.count_nonzero(finest.surface > config.min_time_surface) >= MIN_PIXELS
+        rows, columns = np.nonzero(on_surface if has_surface else has_depth)
         chosen = self._random.permutation(len(rows))[: config.num_patches]
         centres = np.stack([columns[chosen], rows[chosen]], -1)
         patches = []
@@ -218,7 +229,7 @@ class BidirectionalPatchTracker:
             size = config.patch_size if k == 0 else max(3, config.patch_size // 2 | 1)
             at_level = np.unique(centres >> k, axis=0) if k else centres
             patches.append(extract_patches(level.surface, level.depth, at_level.astype(np.int32), size))
-        return patches
+        return _Reference(frame, patches, has_surface)
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]

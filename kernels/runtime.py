@@ -1,5 +1,7 @@
 """Start Taichi, and check what crosses the torch / Taichi boundary."""
 
+import contextlib
+import io
 import os
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -23,6 +25,14 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
         raise ValueError(f"precision: expected 'f32' or 'f64', got {precision!r}")
     if arch == "cuda" and not torch.cuda.is_available():
         raise RuntimeError("cuda: torch finds no CUDA device (or is a CPU build); use --device cpu")
+    with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its device without being asked
+        _start(arch, precision, threads, debug)
+    actual = ti.cfg.arch
+    if (actual == ti.cuda) != (arch == "cuda"):
+        raise RuntimeError(f"{arch}: Taichi started on {actual} instead; use --device cpu")
+
+
+def _start(arch: str, precision: str, threads: int, debug: bool) -> None:
     ti.init(
         arch=ti.cuda if arch == "cuda" else ti.cpu,
         default_fp=ti.f64 if precision == "f64" else ti.f32,
@@ -31,11 +41,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
         offline_cache=True,
         debug=debug,
         log_level=ti.ERROR,
-        verbose=False,
     )
-    actual = ti.cfg.arch
-    if (actual == ti.cuda) != (arch == "cuda"):
-        raise RuntimeError(f"{arch}: Taichi started on {actual} instead; use --device cpu")
 
 
 def workers() -> int:

@@ -40,14 +40,11 @@ class TriangleTable:
 
 
 @ti.func
-def _texel(texels: ti.template(), offset: ti.i32, w: ti.i32, h: ti.i32, x: ti.i32, y: ti.i32, repeat: ti.i32):
-    i, j = x, y
-    if repeat == 1:
-        i = x - w * ti.cast(ti.floor(ti.cast(x, ti.f32) / ti.cast(w, ti.f32)), ti.i32)
-        j = y - h * ti.cast(ti.floor(ti.cast(y, ti.f32) / ti.cast(h, ti.f32)), ti.i32)
-    i = ti.math.clamp(i, 0, w - 1)
-    j = ti.math.clamp(j, 0, h - 1)
-    return texels[offset + j * w + i]
+def _wrapped(index: ti.i32, size: ti.i32, repeat: ti.i32) -> ti.i32:
+    result = ti.math.clamp(index, 0, size - 1)
+    if repeat == 1 and result != index:
+        result = index % size  # Python's sign: never negative
+    return result
 
 
 @ti.func
@@ -60,19 +57,17 @@ def _bilinear(
     u: ti.f32,
     v: ti.f32,
 ):
-    """Look up one level at (u, v) given in texels of level 0."""
+    """Look up one level at (u, v) given in shares of the texture's width and height."""
     offset, w, h = levels[texture, level, 0], levels[texture, level, 1], levels[texture, level, 2]
-    x = u * (ti.cast(w, ti.f32) / ti.cast(levels[texture, 0, 1], ti.f32)) - ti.f32(0.5)
-    y = v * (ti.cast(h, ti.f32) / ti.cast(levels[texture, 0, 2], ti.f32)) - ti.f32(0.5)
-    x0, y0 = ti.floor(x), ti.floor(y)
-    a, b = x - x0, y - y0
-    i, j = ti.cast(x0, ti.i32), ti.cast(y0, ti.i32)
-    top = (1 - a) * _texel(texels, offset, w, h, i, j, repeat) + a * _texel(
-        texels, offset, w, h, i + 1, j, repeat
-    )
-    bottom = (1 - a) * _texel(texels, offset, w, h, i, j + 1, repeat) + a * _texel(
-        texels, offset, w, h, i + 1, j + 1, repeat
-    )
+    x = u * ti.cast(w, ti.f32) - ti.f32(0.5)
+    y = v * ti.cast(h, ti.f32) - ti.f32(0.5)
+    x_floor, y_floor = ti.floor(x), ti.floor(y)
+    a, b = x - x_floor, y - y_floor
+    i, j = ti.cast(x_floor, ti.i32), ti.cast(y_floor, ti.i32)
+    left, right = _wrapped(i, w, repeat), _wrapped(i + 1, w, repeat)
+    upper, lower = offset + w * _wrapped(j, h, repeat), offset + w * _wrapped(j + 1, h, repeat)
+    top = (1 - a) * texels[upper + left] + a * texels[upper + right]
+    bottom = (1 - a) * texels[lower + left] + a * texels[lower + right]
     return (1 - b) * top + b * bottom
 
 
@@ -145,9 +140,8 @@ def _shade(
                 if length_v > length_u:
                     longer = side_v
                     major, minor = length_v, length_u
-                taps = ti.cast(
-                    ti.math.clamp(ti.ceil(major / ti.max(minor, 1e-3) - 0.25), 1.0, float(MAX_TAPS)), ti.i32
-                )
+                ratio = major / ti.max(minor, 1.0)  # shares of less than a texel need no more look-ups
+                taps = ti.cast(ti.math.clamp(ti.ceil(ratio - 0.25), 1.0, float(MAX_TAPS)), ti.i32)
                 coarse = ti.max(minor, major / ti.cast(taps, ti.f32))  # texels one look-up has to average
                 lod = ti.math.clamp(
                     ti.log(ti.max(coarse, 1.0)) * ti.f32(1.4426950408889634),
@@ -157,10 +151,12 @@ def _shade(
                 level = ti.cast(lod, ti.i32)
                 blend = lod - ti.cast(level, ti.f32)
                 repeat = repeats[texture]
+                scale_u = 1 / ti.cast(levels[texture, 0, 1], ti.f32)
+                scale_v = 1 / ti.cast(levels[texture, 0, 2], ti.f32)
                 total = ti.f32(0.0)
                 for k in range(taps):
                     at = (ti.cast(k, ti.f32) + 0.5) / ti.cast(taps, ti.f32) - 0.5
-                    uk, vk = u + at * longer[0], v + at * longer[1]
+                    uk, vk = (u + at * longer[0]) * scale_u, (v + at * longer[1]) * scale_v
                     fine = _bilinear(texels, levels, texture, level, repeat, uk, vk)
                     if blend > 0.01:
                         fine = (1 - blend) * fine + blend * _bilinear(
@@ -171,7 +167,9 @@ def _shade(
             if light >= 0:
                 s = b0 * values[triangle, 18] + b1 * values[triangle, 20] + b2 * values[triangle, 22]
                 t = b0 * values[triangle, 19] + b1 * values[triangle, 21] + b2 * values[triangle, 23]
-                value *= _bilinear(texels, levels, light, 0, 0, s, t)
+                scale_s = 1 / ti.cast(levels[light, 0, 1], ti.f32)
+                scale_t = 1 / ti.cast(levels[light, 0, 2], ti.f32)
+                value *= _bilinear(texels, levels, light, 0, 0, s * scale_s, t * scale_t)
         grey[r] = ti.math.clamp(value, 0.0, 1.0)
         surface[r] = hit_surface
 

@@ -72,6 +72,9 @@ class EventDepthSequence(ABC):
         return self.truth.at(timestamp)
 
 
+MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface shows something
+
+
 class SampledSequence:
     """A sequence cut to [start, start + duration] and divided into samples.
 
@@ -92,9 +95,9 @@ class SampledSequence:
         stamps = sequence.depth_timestamps
         begin = min([first, *stamps[:1]]) + start
         end = np.inf if duration is None else begin + duration
-        # Depth far outside the event stream has nothing to be tracked with.
+        # Depth outside the event stream has nothing to be tracked with.
         inside = stamps[(stamps >= begin - 1e-9) & (stamps <= end + 1e-9)]
-        inside = inside[(inside >= first - max_interval) & (inside <= last + max_interval)]
+        inside = inside[(inside >= first + MIN_HISTORY) & (inside <= last + max_interval)]
         if len(inside) < 2:
             depth_range = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else "nothing"
             raise DataError(

@@ -13,7 +13,7 @@ from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.simulation.scene import Scene
 from kernels.texture import mark_edges, pixel_rays, shade, write_sample_means
 
-EDGE_CONTRAST = 0.01  # Michelson contrast between neighbouring surfaces from which an edge is refined
+EDGE_CONTRAST = 0.02  # Michelson contrast between neighbouring surfaces from which an edge is refined
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,21 @@ class Render:
 
     grey: np.ndarray  # [H, W] float32 in [0, 1]
     depth: np.ndarray  # [H, W] float32 metres along the optical axis at pixel centres, 0: nothing hit
-    cosine: np.ndarray  # [H, W] float32, of the angle between the viewing ray and the surface normal
+    _directions: np.ndarray  # [H W, 3] of the viewing rays
+    _normals: np.ndarray  # [H W, 3] unit normals of what they hit
+
+    @property
+    def cosine(self) -> np.ndarray:  # [H, W] float32
+        """Cosine of the angle between viewing ray and surface normal, not negative."""
+        along = np.abs((self._directions * self._normals).sum(1))
+        return (along / np.linalg.norm(self._directions, axis=1)).reshape(self.depth.shape)
 
 
 class Renderer:
     """Ray caster of one scene and one camera."""
 
     def __init__(
-        self, scene: Scene, camera: Camera, samples_per_edge_pixel: int = 8, background: float = 0.5
+        self, scene: Scene, camera: Camera, samples_per_edge_pixel: int = 6, background: float = 0.5
     ) -> None:
         o3d = load_open3d()
         self._tensor = o3d.core.Tensor
@@ -55,10 +62,8 @@ class Renderer:
             write_sample_means(samples.reshape(len(refine), -1), refine, grey)
         distance = hit["t_hit"].numpy()
         depth = np.where(np.isfinite(distance), distance, 0).astype(np.float32)
-        direction = rays[:, 3:]
-        normal = hit["primitive_normals"].numpy()
-        cosine = np.abs((direction * normal).sum(1)) / np.linalg.norm(direction, axis=1)
-        return Render(grey.reshape(shape), depth.reshape(shape), cosine.reshape(shape))
+        normals = hit["primitive_normals"].numpy()
+        return Render(grey.reshape(shape), depth.reshape(shape), rays[:, 3:], normals)
 
     def _cast(  # type: ignore[no-untyped-def]
         self, T_world_camera: np.ndarray, pixels: np.ndarray, offsets: np.ndarray, scale: float

@@ -38,7 +38,7 @@ class SimulationConfig(Stage):
     """kinect: axial noise, quantised disparity, jittered and missing edges, nothing beyond 5 m."""
     exposure: float = Field(0.0, ge=0, lt=1)
     """Seconds over which an image integrates, centred on its time (motion blur); 0: sharp."""
-    samples_per_pixel: int = Field(8, ge=1, le=64)
+    samples_per_pixel: int = Field(6, ge=1, le=64)
     """Rays of a pixel that shows an edge; others take one ray and a texture look-up filtered to its size."""
     max_motion: float = Field(1.0, gt=0, le=8)
     """Pixels a scene point may move between rendered frames; in between, log intensity is linear."""
