@@ -6,7 +6,7 @@ from pathlib import Path
 
 from edslam_ti.simulation import HandHeldPath, SimulationConfig, make_room, simulate
 
-GENERATOR_VERSION = 1  # raise it when rooms, paths or rendering change, so that old sequences are remade
+GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
 CACHE_VARIABLE = "EDSLAM_CACHE"  # environment variable that overrides the cache folder
 
 

@@ -326,7 +326,7 @@ def floor_lamp(b: SceneBuilder, p: Palette, x: float, y: float, height: float = 
     """Add a standing lamp with a cloth shade."""
     b.cylinder(x, y, 0, 0.03, 0.15, p.black, sides=14)
     b.cylinder(x, y, 0.03, height - 0.25, 0.017, p.metal, sides=8)
-    bright = Material(p.fabric.texture, tint=1.5, luminous=True)
+    bright = Material(p.white.texture, tint=1.08, luminous=True)
     b.cylinder(x, y, height - 0.28, height, 0.2, bright, p.white, sides=16, top_radius=0.14)
 
 
@@ -408,7 +408,7 @@ def sofa(b: SceneBuilder, p: Palette, width: float, seats: int, depth: float = 0
         with b.placed(x + 0.02, -0.36, 0.46, pitch=-10):
             b.box((0, 0, 0), (seat - 0.04, 0.14, 0.42), Material(p.fabric.texture, tint=1.08))
     for x in (arm + 0.12, width - arm - 0.5):
-        with b.placed(x, -0.46, 0.47, yaw=float(rng.uniform(-25, 25)), pitch=-22):
+        with b.placed(x, -0.53, 0.47, yaw=float(rng.uniform(-8, 8)), pitch=-18):
             b.box((0, 0, 0), (0.4, 0.12, 0.38), p.cushion if rng.random() < 0.5 else p.accent)
     for x in (0.05, width - 0.1):
         for y in (-depth + 0.04, -0.1):

@@ -14,6 +14,7 @@ from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.simulation.scene import NO_LIGHT, Scene, Texture
 
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, as OpenCV converts colour to grey
+READER_DEFAULT = 0.6  # base colour that Open3D's obj reader (Assimp) reports where a material has no Kd
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".off", ".stl")
 
 
@@ -94,15 +95,17 @@ class _Part:
             self.image = _grey(np.asarray(image))
             height, width = self.image.shape
             uv = np.asarray(mesh.triangle_uvs).reshape(count, 3, 2)
-            self.coordinates = np.stack(
-                [uv[..., 0] * width, (1 - uv[..., 1]) * height], -1
-            )  # v points up in files
+            # v points up in files (Open3D turns glTF's, which points down).
+            self.coordinates = np.stack([uv[..., 0] * width, (1 - uv[..., 1]) * height], -1)
             self.coloured = True
         if mesh.has_vertex_colors():
             self.tints = (np.asarray(mesh.vertex_colors) @ LUMA)[self.triangles]
             self.coloured = True
         if material is not None:
-            self.tints = self.tints * (np.array(material.base_color, np.float64)[:3] @ LUMA)
+            base = np.array(material.base_color, np.float64)[:3]
+            if path.suffix.lower() == ".obj" and self.coloured and np.allclose(base, READER_DEFAULT):
+                base = np.ones(3)  # the material library gave no Kd
+            self.tints = self.tints * (base @ LUMA)
 
 
 def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] float32 in [0, 1]

@@ -15,7 +15,7 @@ TYPICAL_SPEED = 0.4  # m/s, mean over a long path
 REACH = (0.55, 0.45, 0.22)  # metres, largest excursion along x, y, z
 DWELL = 1.2  # seconds from one sight to the next
 BURST_WIDTH = 0.17  # seconds, Gaussian width of a fast stretch
-MOVE_BURST, GAZE_BURST = 0.9, 2.2  # extra speed in a fast stretch, as a share of the normal speed
+MOVE_BURST, GAZE_BURST = 0.9, 1.6  # extra speed in a fast stretch, as a share of the normal speed
 BURST_INTERVAL = (1.7, 2.6)  # seconds from one fast stretch to the next
 
 

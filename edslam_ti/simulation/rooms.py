@@ -315,7 +315,7 @@ def _office3() -> Room:
     rng = b.rng
     p = f.make_palette(b, wood=0.34, dark=0.15, light=0.5, cloth=(0.45, "tartan"), accent=(0.28, "stripes"))
     wall = _tiled(b, tx.plaster(rng, 0.58))
-    panels = _tiled(b, tx.wood(rng, 0.4, 0.22), turned=True)
+    panels = _tiled(b, tx.wood(rng, 0.4, 0.15), turned=True)
     b.shell(
         {"north": panels, "south": wall, "east": wall, "west": _tiled(b, tx.wallpaper(rng, 0.48, "petals"))},
         _tiled(b, tx.tiles(rng, 0.52)),

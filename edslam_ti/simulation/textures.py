@@ -54,7 +54,7 @@ def wallpaper(rng: np.random.Generator, base: float, pattern: str) -> Array:
     return (base * (1 + 0.09 * figure + 0.04 * noise(rng, 512, 512, 0.8))).astype(np.float32)
 
 
-def wood(rng: np.random.Generator, base: float, contrast: float = 0.16) -> Array:
+def wood(rng: np.random.Generator, base: float, contrast: float = 0.11) -> Array:
     """Grain along x with year rings and pores."""
     y = np.linspace(0, 1, 512, endpoint=False)[:, None]
     warp = noise(rng, 512, 1024, 1.9, stretch=5)
@@ -66,7 +66,7 @@ def wood(rng: np.random.Generator, base: float, contrast: float = 0.16) -> Array
 def planks(rng: np.random.Generator, base: float, boards: int = 12) -> Array:
     """Floor boards of 1024 x 768 texels, each cut from its own piece of wood, with dark joints."""
     height, width = 768, 1024
-    source = np.concatenate([wood(rng, 1.0, 0.17), wood(rng, 1.0, 0.2)], 0)
+    source = np.concatenate([wood(rng, 1.0, 0.11), wood(rng, 1.0, 0.14)], 0)
     image = np.empty((height, width), np.float32)
     rows = np.linspace(0, height, boards + 1).astype(int)
     for a, b in itertools.pairwise(rows):
@@ -109,14 +109,14 @@ def brick(rng: np.random.Generator, base: float) -> Array:
         image[r * h : (r + 1) * h] = np.roll(row, (r % 2) * w // 2)
     image *= base * (1 + 0.12 * noise(rng, height, width, 0.9))
     for r in range(courses):
-        image[r * h : r * h + 3] = base * 1.9
+        image[r * h : r * h + 3] = base * 1.6
         for k in range(per_row):
             c = (k * w + (r % 2) * w // 2) % width
-            image[r * h : (r + 1) * h, c : c + 3] = base * 1.9
+            image[r * h : (r + 1) * h, c : c + 3] = base * 1.6
     return image
 
 
-def carpet(rng: np.random.Generator, base: float, contrast: float = 0.13) -> Array:
+def carpet(rng: np.random.Generator, base: float, contrast: float = 0.09) -> Array:
     """Short-pile carpet: fine tufts with large worn patches and carpet-tile joints."""
     image = base * (1 + contrast * (noise(rng, 512, 512, 0.35) + 0.55 * noise(rng, 512, 512, 1.6)))
     flecks = noise(rng, 512, 512, 0.2) > 1.9
@@ -143,8 +143,8 @@ def rug(rng: np.random.Generator, base: float, height: int = 384, width: int = 5
 def fabric(rng: np.random.Generator, base: float, pattern: str = "weave") -> Array:
     """Cloth: weave, tartan, or stripes."""
     y, x = np.mgrid[0:256, 0:256]
-    weave = 0.10 * np.sign(np.sin(2 * np.pi * x / 8) * np.sin(2 * np.pi * y / 8))
-    image = 1 + weave + 0.10 * noise(rng, 256, 256, 1.0) + 0.08 * noise(rng, 256, 256, 0.2)
+    weave = 0.06 * np.sign(np.sin(2 * np.pi * x / 8) * np.sin(2 * np.pi * y / 8))
+    image = 1 + weave + 0.07 * noise(rng, 256, 256, 1.0) + 0.05 * noise(rng, 256, 256, 0.2)
     if pattern == "tartan":
         for period, width, gain in ((64, 20, 0.62), (128, 8, 1.5), (64, 4, 0.7)):
             image = image * np.where(x % period < width, gain, 1) * np.where(y % period < width, gain, 1)
@@ -217,8 +217,8 @@ def paper(rng: np.random.Generator) -> Array:
 
 def book_spine(rng: np.random.Generator) -> Array:
     """A spine, top up: cloth shade, bands, a vertical title, a publisher's mark."""
-    base = float(rng.choice([0.1, 0.16, 0.25, 0.35, 0.5, 0.65, 0.8, 0.9]))
-    ink = 0.92 if base < 0.45 else 0.08
+    base = float(rng.choice([0.16, 0.2, 0.25, 0.32, 0.42, 0.55, 0.68, 0.8]))
+    ink = 0.8 if base < 0.45 else 0.14
     image = base * (1 + 0.08 * noise(rng, 192, 40, 0.8))
     for r in rng.choice([10, 16, 24, 160, 170, 180], 3, replace=False):
         image[r : r + int(rng.integers(2, 5))] = ink
