@@ -63,7 +63,9 @@ class GaussianMap:
 
     @property
     def colors(self) -> Tensor:  # [N, 1] brightness in (0, 1)
-        shared = self._cell_table[self._cells].sum(-1, keepdim=True)
+        # index_select adds its gradients up in order; indexing does it in parallel, differently every run
+        shared = self._cell_table.index_select(0, self._cells.reshape(-1)).view_as(self._cells)
+        shared = shared.sum(-1, keepdim=True)
         return (self._raw["logit_colors"] + shared).sigmoid()
 
     def add(
@@ -83,7 +85,7 @@ class GaussianMap:
             "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(m, 1),
             "log_scales": scales.log(),
             "logit_opacities": torch.full((m,), opacity).logit(),
-            "logit_colors": colors.clamp(0.001, 0.999).logit() - shared,
+            "logit_colors": colors.clamp(0.0001, 0.9999).logit() - shared,
         }
         moments = {
             name: {key: torch.cat([value, torch.zeros_like(new[name])]) for key, value in state.items()}

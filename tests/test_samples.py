@@ -13,7 +13,7 @@ from edslam_ti.trajectory import Trajectory
 
 
 class MemorySequence(EventDepthSequence):
-    """One event per millisecond over a second; depth and images hold their own index."""
+    """One event at time 0, then one per millisecond over a second; depth and images hold their own index."""
 
     dataset, scene, description = "memory", "test", "in memory"
     camera = Camera(width=4, height=3, fx=4.0, fy=4.0, cx=1.5, cy=1.0)
@@ -24,9 +24,9 @@ class MemorySequence(EventDepthSequence):
     ) -> None:
         self.depth_timestamps, self.image_timestamps = depth_timestamps, image_timestamps
         self.truth = truth
-        t = np.arange(1000) / 1000 + 0.0005
-        zeros = np.zeros(1000, np.int16)
-        self._events = Events(zeros, zeros, t, np.ones(1000, np.int8))
+        t = np.append(0.0, np.arange(1000) / 1000 + 0.0005)
+        zeros = np.zeros(len(t), np.int16)
+        self._events = Events(zeros, zeros, t, np.ones(len(t), np.int8))
 
     def depth(self, index: int) -> np.ndarray:
         return np.full(self.camera.shape, index + 1, np.float32)
@@ -47,7 +47,9 @@ def sequence(depth_every: float = 0.05, image_every: float = 0.1) -> MemorySeque
     poses = np.tile(np.eye(4), (len(steps), 1, 1))
     poses[:, 0, 3] = steps
     return MemorySequence(
-        np.arange(0, 1 + 1e-9, depth_every), np.arange(0, 1 + 1e-9, image_every), Trajectory(steps, poses)
+        np.arange(depth_every, 1 + 1e-9, depth_every),
+        np.arange(0, 1 + 1e-9, image_every),
+        Trajectory(steps, poses),
     )
 
 
@@ -55,7 +57,7 @@ def test_every_depth_image_ends_a_sample() -> None:
     samples = SampledSequence(sequence(0.05), start=0.0, duration=None, max_interval=0.1)
     np.testing.assert_allclose(samples.timestamps, sequence(0.05).depth_timestamps)
     assert samples.has_depth.all()
-    assert [int(s.depth[0, 0]) for s in samples if s.depth is not None] == list(range(1, 22))
+    assert [int(s.depth[0, 0]) for s in samples if s.depth is not None] == list(range(1, 21))
 
 
 def test_events_of_the_samples_part_the_stream() -> None:
@@ -75,7 +77,7 @@ def test_first_sample_has_a_little_history() -> None:
 def test_long_gaps_are_divided_evenly_by_samples_without_depth() -> None:
     samples = SampledSequence(sequence(depth_every=0.25), start=0.0, duration=None, max_interval=0.1)
     np.testing.assert_allclose(np.diff(samples.timestamps), 0.25 / 3)
-    assert samples.has_depth.tolist() == [True, *[False, False, True] * 4]
+    assert samples.has_depth.tolist() == [True, *[False, False, True] * 3]
     assert samples[1].depth is None
     assert samples[3].depth is not None
     assert samples[3].depth[0, 0] == 2
@@ -83,29 +85,29 @@ def test_long_gaps_are_divided_evenly_by_samples_without_depth() -> None:
 
 def test_gap_of_exactly_the_longest_interval_is_not_divided() -> None:
     samples = SampledSequence(sequence(depth_every=0.1), start=0.0, duration=None, max_interval=0.1)
-    assert len(samples) == 11
+    assert len(samples) == 10
 
 
 def test_start_and_duration_cut_the_sequence() -> None:
     samples = SampledSequence(sequence(0.05), start=0.3, duration=0.2, max_interval=0.1)
     np.testing.assert_allclose(samples.timestamps, [0.3, 0.35, 0.4, 0.45, 0.5])
     assert samples[0].depth is not None
-    assert samples[0].depth[0, 0] == 7
+    assert samples[0].depth[0, 0] == 6
 
 
 def test_depth_far_outside_the_events_is_left_out() -> None:
-    late = MemorySequence(np.arange(-1, 3, 0.05), np.empty(0))
+    late = MemorySequence(np.arange(-1, 3, 0.05).round(2), np.empty(0))
     times = SampledSequence(late, start=-10.0, duration=None, max_interval=0.1).timestamps
-    assert -0.11 < times[0] < 0
+    assert times[0] == pytest.approx(0.05)  # not at 0: no events would be behind it
     assert 1 < times[-1] < 1.11
 
 
 def test_images_and_true_poses_come_with_the_samples_that_have_them() -> None:
     samples = SampledSequence(sequence(0.05, image_every=0.1), start=0.0, duration=None, max_interval=0.1)
-    assert samples[2].image is not None
-    assert samples[2].image[0, 0] == pytest.approx(0.01)
-    assert samples[1].image is None
-    pose = samples[3].T_world_camera
+    assert samples[1].image is not None
+    assert samples[1].image[0, 0] == pytest.approx(0.01)
+    assert samples[2].image is None
+    pose = samples[2].T_world_camera
     assert pose is not None
     assert pose[0, 3] == pytest.approx(0.15)  # between two true poses, Eq. 9
 
@@ -121,13 +123,21 @@ def test_sequence_without_images_or_truth_is_sampled_all_the_same() -> None:
 def test_fewer_than_two_depth_images_is_an_error_that_says_what_there_is(
     start: float, duration: float | None
 ) -> None:
-    with pytest.raises(DataError, match=r"at least 2 depth images .* depth covers 0\.000 to 1\.000 s"):
+    with pytest.raises(DataError, match=r"at least 2 depth images .* depth covers 0\.050 to 1\.000 s"):
         SampledSequence(sequence(), start=start, duration=duration, max_interval=0.1)
 
 
 def test_sequence_without_depth_is_an_error() -> None:
     with pytest.raises(DataError, match="depth covers nothing"):
         SampledSequence(MemorySequence(np.empty(0), np.empty(0)), 0.0, None, 0.1)
+
+
+def test_start_counts_from_the_first_event_or_depth_image() -> None:
+    later = MemorySequence(np.arange(20.05, 21, 0.05), np.empty(0))
+    events = later._events
+    later._events = Events(events.x, events.y, events.t + 20.0, events.polarity)
+    samples = SampledSequence(later, start=0.5, duration=0.2, max_interval=0.1)
+    np.testing.assert_allclose(samples.timestamps, [20.5, 20.55, 20.6, 20.65, 20.7])
 
 
 def test_index_beyond_the_end_is_an_error() -> None:
