@@ -84,6 +84,8 @@ class MappingConfig(Stage):
     """Steps after the first keyframe has seen some motion."""
     final_iterations: int = Field(400, ge=0)
     """Steps over all keyframes after the last frame."""
+    reduced_share: float = Field(0.5, ge=0, le=1)
+    """Share of the steps that work on images of half the size, at a third of the cost."""
     pixel_stride: int = Field(2, ge=1)
     """One new Gaussian for every stride x stride pixels that need one."""
     min_visibility: float = Field(0.8, gt=0, lt=1)
@@ -96,7 +98,7 @@ class MappingConfig(Stage):
     """Opacity of a new Gaussian."""
     min_opacity: float = Field(0.05, ge=0, lt=1)
     """Gaussians that have become fainter are pruned."""
-    intervals: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+    intervals: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
     """Lengths of the event intervals of Eq. 10-11 in seconds, drawn at random: short ones give detail,
     long ones tie the brightness of distant surfaces together."""
     bins_per_chunk: int = Field(5, ge=1)
@@ -111,7 +113,7 @@ class MappingConfig(Stage):
     """lambda_reg of Eq. 16 (paper: 0.25)."""
     max_scale_ratio: float = Field(10.0, ge=1)
     """r of Eq. 14: Gaussians may be this much longer than thick."""
-    log_epsilon: float = Field(0.01, gt=0)
+    log_epsilon: float = Field(0.004, gt=0)
     """Added to brightness before the logarithm of Eq. 10."""
     background: float = Field(0.5, gt=0, lt=1)
     """Brightness where nothing is drawn; also of new Gaussians without neighbours."""
@@ -132,7 +134,7 @@ class MappingConfig(Stage):
     """Adam's learning rate of the cells' brightness offsets."""
     bundle_adjustment: bool = True
     """Optimise the frames' poses together with the map."""
-    poses_rate: float = Field(1e-4, gt=0)
+    poses_rate: float = Field(2e-5, gt=0)
     """Adam's learning rate of poses, metres and radians."""
 
 

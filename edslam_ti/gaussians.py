@@ -1,6 +1,7 @@
 """The Gaussian map (Sec. III-C): parameters, activations, and an Adam optimiser that grows with it."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,9 +15,24 @@ CELL_TABLE = 1 << 14  # entries a level; distant cells may share one, which only
 CELL_PRIMES = (73856093, 19349663, 83492791)  # Teschner et al. 2003, spatial hashing
 
 
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as they are rendered."""
+
+    means: Tensor  # [N, 3] metres, world
+    quats: Tensor  # [N, 4] wxyz, any norm
+    scales: Tensor  # [N, 3] metres
+    opacities: Tensor  # [N] in (0, 1)
+    colors: Tensor  # [N, 1] brightness in (0, 1)
+
+
 class GaussianMap:
     """N Gaussians as raw (unbounded) parameters: means [N, 3] in metres (world), quats [N, 4] wxyz,
     log_scales [N, 3], logit_opacities [N], logit_colors [N, 1] (brightness in (0, 1) behind a sigmoid).
+
+    A Gaussian's brightness logit is its own plus those of the cells it lies in, at several cell sizes.
+    Events tie brightness together only across edges, so that one Gaussian at a time a large surface
+    takes thousands of steps to find its level; cells let it move as one.
     """
 
     def __init__(self, config: MappingConfig) -> None:
@@ -45,28 +61,18 @@ class GaussianMap:
         """Raw parameters by name."""
         return self._raw
 
-    @property
-    def means(self) -> Tensor:  # [N, 3] metres
-        return self._raw["means"]
-
-    @property
-    def quats(self) -> Tensor:  # [N, 4] wxyz, any norm
-        return self._raw["quats"]
-
-    @property
-    def scales(self) -> Tensor:  # [N, 3] metres
-        return self._raw["log_scales"].exp()
-
-    @property
-    def opacities(self) -> Tensor:  # [N] in (0, 1)
-        return self._raw["logit_opacities"].sigmoid()
-
-    @property
-    def colors(self) -> Tensor:  # [N, 1] brightness in (0, 1)
+    def activated(self) -> Gaussians:
+        """Return what is rendered, differentiable in the raw parameters; compute it once a step."""
+        raw = self._raw
         # index_select adds its gradients up in order; indexing does it in parallel, differently every run
         shared = self._cell_table.index_select(0, self._cells.reshape(-1)).view_as(self._cells)
-        shared = shared.sum(-1, keepdim=True)
-        return (self._raw["logit_colors"] + shared).sigmoid()
+        return Gaussians(
+            raw["means"],
+            raw["quats"],
+            raw["log_scales"].exp(),
+            raw["logit_opacities"].sigmoid(),
+            (raw["logit_colors"] + shared.sum(-1, keepdim=True)).sigmoid(),
+        )
 
     def add(
         self,

@@ -16,6 +16,7 @@ class Keyframe:
     index: int  # of the frame in the trajectory
     timestamp: float  # seconds
     depth: np.ndarray  # [H, W] float32 metres, 0 = missing
+    reduced_depth: np.ndarray  # [H / 2, W / 2]
 
 
 def is_keyframe(

@@ -11,7 +11,7 @@ from torch import Tensor
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.frame import Frame
-from edslam_ti.gaussians import GaussianMap
+from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import interpolate, orthonormalized, se3_exp
 from edslam_ti.keyframes import EventArchive, Keyframe, is_keyframe
 from edslam_ti.losses import brightness_change, depth_loss, event_loss, scale_loss
@@ -21,6 +21,8 @@ from edslam_ti.trajectory import Trajectory
 
 Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
 
+REDUCTION = 2  # of the images in reduced steps: pyramid level 1
+ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
 MIN_CHUNKS = 3  # events of so many chunks are needed before the map's brightness can be optimised
 HELD_OUT_MARGIN = 0.15  # fraction of a chunk around a held-out time where no interval may begin or end
 
@@ -127,7 +129,8 @@ class GaussianMapper:
         first_time = len(self._archive) == MIN_CHUNKS
         steps = self._config.initial_iterations if first_time else self._config.iterations
         for _ in range(steps):
-            self._optimise(trajectory, newest_share=0.4)
+            # A young map's errors would pull the poses along: they are adjusted to the finished one.
+            self._optimise(trajectory, 0.4, self._reduction(), adjusts_poses=False)
         self._prune()
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
@@ -139,7 +142,8 @@ class GaussianMapper:
             rate = 0.05 ** (k / steps)  # ends at a twentieth
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
-            self._optimise(trajectory, newest_share=0.0)
+            adjusts_poses = self._adjusts_poses and k >= ADJUST_FROM * steps
+            self._optimise(trajectory, 0.0, self._reduction(), adjusts_poses)
             if not progress((k + 1) / steps):
                 break
         self._prune()
@@ -150,16 +154,18 @@ class GaussianMapper:
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the Gaussians' centres and brightness."""
-        return self.gaussians.means.detach().numpy(), self.gaussians.colors.detach().numpy()[:, 0]
+        with torch.no_grad():
+            gaussians = self.gaussians.activated()
+        return gaussians.means.detach().numpy(), gaussians.colors.numpy()[:, 0]
 
     # --- growing ---
 
     def _take_in_depth(self, frame: Frame, index: int, trajectory: Trajectory) -> None:
         assert frame.depth is not None
         T = trajectory.pose(index)
-        candidate = Keyframe(index, frame.timestamp, frame.depth)
+        candidate = Keyframe(index, frame.timestamp, frame.depth, frame.level(1).depth)
         with torch.no_grad():
-            view = render(self.gaussians, self._camera, torch.from_numpy(T), self._config.background)
+            view = self._render(self.gaussians.activated(), torch.from_numpy(T))
         if not self.keyframes or self._is_keyframe(candidate, view.visible, trajectory):
             self.keyframes.append(candidate)
         self._recent = [*self._recent, candidate][-self._keyframe_config.num_chunks :]
@@ -170,9 +176,7 @@ class GaussianMapper:
         last = self.keyframes[-1]
         T_last, T_now = trajectory.pose(last.index), trajectory.pose(frame.index)
         with torch.no_grad():
-            seen = render(
-                self.gaussians, self._camera, torch.from_numpy(T_last), self._config.background
-            ).visible
+            seen = self._render(self.gaussians.activated(), torch.from_numpy(T_last)).visible
         union = int((visible | seen).sum())
         covisibility = int((visible & seen).sum()) / max(union, 1)
         translation = float(np.linalg.norm(T_now[:3, 3] - T_last[:3, 3]))
@@ -216,27 +220,35 @@ class GaussianMapper:
 
     def _prune(self) -> None:
         """Remove Gaussians that have faded."""
-        keep = self.gaussians.opacities.detach() > self._config.min_opacity
+        keep = self.gaussians.raw["logit_opacities"].detach().sigmoid() > self._config.min_opacity
         if not bool(keep.all()):
             self.gaussians.keep(keep)
 
     # --- optimising ---
 
-    def _optimise(self, trajectory: Trajectory, newest_share: float) -> None:
+    def _reduction(self) -> int:
+        """Draw the size of the next step's images: reduced ones cost a third and settle large surfaces."""
+        return REDUCTION if self._random.random() < self._config.reduced_share else 1
+
+    def _optimise(
+        self, trajectory: Trajectory, newest_share: float, reduction: int, adjusts_poses: bool
+    ) -> None:
         """One step of Eq. 16 on a random event interval, and now and then a depth image."""
         config = self._config
-        poses = _Poses(trajectory, self._adjusts_poses)
+        poses = _Poses(trajectory, adjusts_poses)
+        gaussians = self.gaussians.activated()
         start, end = self._draw_interval(newest_share)
-        measured = self._archive.sum_before(*end) - self._archive.sum_before(*start)
-        change = torch.from_numpy(measured.astype(np.float32)) * self._contrast_threshold  # Eq. 11
-        views = [self._render_edge(poses, edge) for edge in (start, end)]
+        polarity = self._archive.sum_before(*end) - self._archive.sum_before(*start)
+        measured = self._contrast_threshold * block_means(polarity.astype(np.float32), reduction)  # Eq. 11
+        views = [self._render(gaussians, self._pose_at(poses, edge), reduction) for edge in (start, end)]
         predicted = brightness_change(views[0].intensity, views[1].intensity, config.log_epsilon)
-        loss = event = event_loss(predicted, change)
-        loss = config.event_weight * loss
+        event = event_loss(predicted, torch.from_numpy(measured))
+        loss = config.event_weight * event
         if self._num_steps % config.depth_every == 0 and config.depth_weight > 0:
             frame = self._draw_depth(newest_share)
-            view = render(self.gaussians, self._camera, poses.of_frame(frame.index), config.background)
-            loss = loss + config.depth_weight * depth_loss(view.depth, torch.from_numpy(frame.depth))
+            view = self._render(gaussians, poses.of_frame(frame.index), reduction)
+            depth = torch.from_numpy(frame.depth if reduction == 1 else frame.reduced_depth)
+            loss = loss + config.depth_weight * depth_loss(view.depth, depth)
         if config.scale_weight > 0:
             loss = loss + config.scale_weight * scale_loss(
                 self.gaussians.raw["log_scales"], config.max_scale_ratio
@@ -250,10 +262,12 @@ class GaussianMapper:
         value = float(event.detach())
         self.loss = value if np.isnan(self.loss) else 0.95 * self.loss + 0.05 * value
 
-    def _render_edge(self, poses: _Poses, edge: tuple[int, int]) -> RenderOutput:
+    def _render(self, gaussians: Gaussians, T_world_camera: Tensor, reduction: int = 1) -> RenderOutput:
+        return render(gaussians, self._camera, T_world_camera, self._config.background, reduction)
+
+    def _pose_at(self, poses: _Poses, edge: tuple[int, int]) -> Tensor:
         chunk, bin_index = edge
-        pose = poses.within(chunk, bin_index / self._config.bins_per_chunk)
-        return render(self.gaussians, self._camera, pose, self._config.background)
+        return poses.within(chunk, bin_index / self._config.bins_per_chunk)
 
     def _draw_interval(self, newest_share: float) -> tuple[tuple[int, int], tuple[int, int]]:
         """Draw the two edges (chunk, bin) of an interval, its length from `intervals`."""
@@ -286,6 +300,15 @@ class GaussianMapper:
             return self._recent[-1]
         frames = self.keyframes + self._recent
         return frames[int(self._random.integers(len(frames)))]
+
+
+def block_means(image: np.ndarray, reduction: int) -> np.ndarray:  # [H, W] -> [H / r, W / r]
+    """Return the means of blocks of reduction x reduction pixels, odd edges cut off."""
+    if reduction == 1:
+        return image
+    h, w = image.shape[0] // reduction, image.shape[1] // reduction
+    cut = image[: h * reduction, : w * reduction]
+    return cut.reshape(h, reduction, w, reduction).mean((1, 3), dtype=np.float32)
 
 
 def densify_mask(

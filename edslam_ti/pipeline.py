@@ -250,8 +250,10 @@ def _true_trajectory(state: Run) -> Trajectory | None:
 
 def _errors(state: Run) -> dict[str, float | None]:
     """Return the trajectory's errors by metric name; None without (enough) truth."""
-    names = ("ate_rmse_cm", "ate_mean_cm", "ate_median_cm", "ate_max_cm", "ate_rmse_sim3_cm")
-    names += ("rpe_trans_cm", "rpe_rot_deg")
+    names = (
+        *("ate_rmse_cm", "ate_mean_cm", "ate_median_cm", "ate_max_cm", "ate_rmse_sim3_cm"),
+        *("rpe_trans_cm", "rpe_rot_deg"),
+    )
     truth = _true_trajectory(state)
     if truth is None or len(truth) < 3:
         return dict.fromkeys(names)
@@ -351,7 +353,7 @@ def _write_map(state: Run, mapper: Mapper, folder: Path) -> None:
             raw["quats"],
             raw["log_scales"],
             raw["logit_opacities"],
-            mapper.gaussians.colors.detach().numpy(),
+            mapper.gaussians.activated().colors.detach().numpy(),
         )
     trajectory = state.slam.trajectory
 

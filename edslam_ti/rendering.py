@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from edslam_ti.camera import Camera
-from edslam_ti.gaussians import GaussianMap
+from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import inverse
+from kernels.projection import LOW_PASS
 from kernels.rasterization import rasterize
 
 MIN_ALPHA = 1e-3  # below this there is no depth to speak of
@@ -40,12 +41,14 @@ class View:
 
 
 def render(
-    gaussians: GaussianMap,
+    gaussians: Gaussians,
     camera: Camera,
     T_world_camera: Tensor,  # [4, 4]
     background: float,  # brightness behind everything
+    reduction: int = 1,  # render at 1 / reduction of the camera's size
 ) -> RenderOutput:
-    """Return the map seen from a pose (Eq. 6-8)."""
+    """Return the map seen from a pose (Eq. 6-8), at full size or as the mean of blocks of pixels."""
+    at_size = camera if reduction == 1 else camera.downscaled(reduction)
     drawn = rasterize(
         gaussians.means,
         gaussians.quats,
@@ -53,11 +56,18 @@ def render(
         gaussians.opacities,
         gaussians.colors,
         inverse(T_world_camera).float(),
-        camera.intrinsics,
-        (camera.width, camera.height),
+        at_size.intrinsics,
+        (at_size.width, at_size.height),
+        low_pass=reduced_low_pass(reduction),
     )
     intensity = drawn.image[..., 0] + (1 - drawn.alpha) * background
     return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible)
+
+
+def reduced_low_pass(reduction: int) -> float:
+    """Return the filter, in reduced px^2, that blurs like the full-size one and averages the blocks."""
+    block_variance = (reduction**2 - 1) / 12
+    return (LOW_PASS + block_variance) / reduction**2
 
 
 @torch.no_grad()
@@ -65,5 +75,5 @@ def render_view(
     gaussians: GaussianMap, camera: Camera, T_world_camera: np.ndarray, background: float
 ) -> View:
     """Return a view as arrays, with expected depth."""
-    output = render(gaussians, camera, torch.from_numpy(T_world_camera), background)
+    output = render(gaussians.activated(), camera, torch.from_numpy(T_world_camera), background)
     return View(output.intensity.numpy(), output.expected_depth.numpy(), output.alpha.numpy())

@@ -219,7 +219,7 @@ class BidirectionalPatchTracker:
         finest = frame.level(0)
         has_depth = finest.depth > 0
         on_surface = has_depth & (finest.surface > config.min_time_surface)
-        has_surface = np.count_nonzero(finest.surface > config.min_time_surface) >= MIN_PIXELS
+        has_surface = int((finest.surface > config.min_time_surface).sum()) >= MIN_PIXELS
         rows, columns = np.nonzero(on_surface if has_surface else has_depth)
         chosen = self._random.permutation(len(rows))[: config.num_patches]
         centres = np.stack([columns[chosen], rows[chosen]], -1)

@@ -6,14 +6,14 @@ For one Gaussian with mean mu, rotation R(q) and scales s, seen from T_camera_wo
     m  = (f_x p_x / p_z + c_x, f_y p_y / p_z + c_y)     pixels
     J  = [f_x/p_z, 0, -f_x p_x/p_z^2;  0, f_y/p_z, -f_y p_y/p_z^2]
     A  = J R_c R(q) diag(s)                       [2, 3]
-    S' = A A^T + 0.3 I                            Eq. 7, with the usual low-pass filter of 0.3 px^2
+    S' = A A^T + low_pass I                       Eq. 7, with the usual low-pass filter, 0.3 px^2
     K  = S'^-1                                    the conic: alpha = o exp(-1/2 d^T K d), Eq. 8
 """
 
 import taichi as ti
 
 NEAR = 0.05  # metres; nearer Gaussians are culled
-LOW_PASS = 0.3  # px^2 added to the 2D covariance (Kerbl et al. 2023)
+LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian ends where its alpha falls below this
 CULLED = 0x7FFFFFFF  # sort key of a Gaussian that is not drawn: after all others
 
@@ -80,6 +80,7 @@ def _project_forward(
     width: ti.i32,
     height: ti.i32,
     tile: ti.i32,
+    low_pass: float,  # px^2
     # outputs
     record: ti.types.ndarray(ndim=2),  # [N, RECORD_SIZE]
     keys: ti.types.ndarray(ti.i64, ndim=1),  # [N] depth bits above, index below: unique, sortable
@@ -98,7 +99,7 @@ def _project_forward(
                 q, _ = load_quaternion(quats, i)
                 M = R_c @ rotation_of(q)
                 j02, j12 = -fx * p[0] * inv_z * inv_z, -fy * p[1] * inv_z * inv_z
-                cov_xx, cov_xy, cov_yy = LOW_PASS, 0.0, LOW_PASS
+                cov_xx, cov_xy, cov_yy = low_pass, 0.0, low_pass
                 for k in ti.static(range(3)):
                     a = (fx * inv_z * M[0, k] + j02 * M[2, k]) * scales[i, k]
                     b = (fy * inv_z * M[1, k] + j12 * M[2, k]) * scales[i, k]

@@ -28,6 +28,7 @@ from kernels.projection import (
     EXTENT,
     GRADIENT_SIZE,
     HALF_HEIGHT,
+    LOW_PASS,
     MEAN_X,
     MEAN_Y,
     OPACITY,
@@ -332,7 +333,9 @@ class Rasterization:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, colors, T_camera_world, intrinsics, size, tile):
+    def forward(
+        ctx, means, quats, scales, opacities, colors, T_camera_world, intrinsics, size, tile, low_pass
+    ):
         width, height = size
         inputs = [
             plain(name, tensor)
@@ -354,7 +357,7 @@ class _Rasterize(torch.autograd.Function):
         keys = torch.empty(n, dtype=torch.int64, device=device)
         _project_forward(
             means_, quats_, scales_, opacities_, pose_, *intrinsics, width, height, tile,
-            record, keys, num_tiles,
+            low_pass, record, keys, num_tiles,
         )  # fmt: skip
         keys, num_drawn = _sorted_by_depth(keys)
         tiles = -(-width // tile) * -(-height // tile)
@@ -403,7 +406,7 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
         grad_pose = torch.zeros_like(pose)
         grad_pose[:3] = pose_parts.sum(0, dtype=torch.float64).view(3, 4).to(pose.dtype)
-        return *grads, grad_opacities, grad_colors, grad_pose, None, None, None
+        return *grads, grad_opacities, grad_colors, grad_pose, None, None, None, None
 
 
 def _sorted_by_depth(keys: Tensor) -> tuple[Tensor, int]:
@@ -424,6 +427,7 @@ def rasterize(
     intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy; pixel centres at integers
     size: tuple[int, int],  # (width, height)
     tile: int = TILE,
+    low_pass: float = LOW_PASS,  # px^2 added to every 2D covariance; less in a view of reduced size
 ) -> Rasterization:
     """Render Gaussians: colours, depth and alpha, differentiable in all tensor arguments.
 
@@ -441,6 +445,15 @@ def rasterize(
     ):
         check_shape(name, tensor, shape)
     outputs = _Rasterize.apply(
-        means, quats, scales, opacities, colors, T_camera_world, tuple(intrinsics), tuple(size), tile
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        T_camera_world,
+        tuple(intrinsics),
+        tuple(size),
+        tile,
+        low_pass,
     )
     return Rasterization(*outputs)
