@@ -25,7 +25,7 @@ from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation import evaluate_images, trajectory_errors
+from edslam_ti.evaluation import evaluate_images, fit_event_nerf, psnr, trajectory_errors
 from edslam_ti.export import fuse_mesh, write_gaussian_ply, write_mesh, write_points
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping import GaussianMapper, Mapper
@@ -83,6 +83,8 @@ def run(config: Config, console: Console | None = None) -> Path:
         if state.slam.mapper is not None and not interrupt.requested:
             _finish(state, state.slam.mapper, interrupt, console)
         state.is_interrupted = interrupt.requested
+    if state.is_interrupted and len(state.slam.trajectory) == 0:
+        raise KeyboardInterrupt  # there is nothing to save
     if state.is_interrupted:
         console.print("interrupted: saving what there is")
         state.note("interrupted")
@@ -204,15 +206,16 @@ def _save(state: Run, console: Console) -> Path:
     config, sequence = state.config, state.sequence
     parent = config.out / sequence.dataset / sequence.scene / config.method
     folder = _unused(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+    truth = _true_trajectory(state)
     with console.status("saving"), atomic_folder(folder) as partial:
         write_tum(state.slam.trajectory, partial / "trajectory_tum.txt")
+        if truth is not None:
+            write_tum(truth, partial / "truth_tum.txt")
         (partial / "config.yaml").write_text(config.to_yaml())
         metrics = _metrics(state, partial)
         if state.slam.mapper is not None:
             _write_map(state, state.slam.mapper, partial)
-        plot_trajectory(
-            partial / "trajectory.png", {config.method: state.slam.trajectory}, _true_trajectory(state)
-        )
+        plot_trajectory(partial / "trajectory.png", {config.method: state.slam.trajectory}, truth)
         metrics["wall_s"] = round(time.perf_counter() - state.started, 2)
         metrics["total_fps"] = round(metrics["num_frames"] / metrics["wall_s"], 3)
         metrics["peak_memory_mb"] = round(_peak_memory_mb(), 1)
@@ -310,16 +313,15 @@ def _image_metrics(state: Run, folder: Path) -> dict[str, Any]:
     for k in indices:
         views.append(slam.mapper.render(state.sequence.camera, slam.trajectory.pose(k)))
     metrics = dict(nothing)
-    if views and all(s.image is not None for s in samples):
-        measured = evaluate_images(
-            [v.intensity for v in views],
-            [s.image for s in samples if s.image is not None],
-            [s.depth > 0 if s.depth is not None else None for s in samples],
-            lpips_weights=evaluation.lpips_weights,
-        )
+    renders, captions = [v.intensity for v in views], [""] * len(views)
+    truths = [s.image for s in samples if s.image is not None]
+    if views and len(truths) == len(views):
+        masks = [s.depth > 0 if s.depth is not None else None for s in samples]
+        measured = evaluate_images(renders, truths, masks, lpips_weights=evaluation.lpips_weights)
         for name in nothing:
             if hasattr(measured, name):
                 metrics[name] = _rounded(getattr(measured, name))
+        captions = _captions(renders, truths, masks)
     errors = [
         np.abs(v.depth - s.depth)[(s.depth > 0) & (v.depth > 0)]
         for v, s in zip(views, samples)
@@ -331,11 +333,28 @@ def _image_metrics(state: Run, folder: Path) -> dict[str, Any]:
     write_render_triptychs(
         folder / "renders",
         timestamps=[s.timestamp for s in samples],
-        renders=[v.intensity for v in views],
+        renders=renders,
         truths=[s.image for s in samples],
         depths=[v.depth for v in views],
+        captions=captions,
     )
     return metrics
+
+
+def _captions(
+    renders: list[np.ndarray],  # V of [H, W]
+    truths: list[np.ndarray],  # V of [H, W]
+    masks: list[np.ndarray | None],  # V of [H, W] bool, counted pixels
+) -> list[str]:
+    """Return each view's PSNR after the fit over all views."""
+    counted = [np.zeros(t.shape, bool) if m is None else m for t, m in zip(truths, masks)]
+    if not any(m.any() for m in counted):
+        return [""] * len(renders)
+    fit = fit_event_nerf(renders, truths, counted)
+    return [
+        f"PSNR {psnr([fit(r)], [t], [m]):.1f} dB corrected" if m.any() else ""
+        for r, t, m in zip(renders, truths, counted)
+    ]
 
 
 def _write_map(state: Run, mapper: Mapper, folder: Path) -> None:
@@ -362,7 +381,10 @@ def _write_map(state: Run, mapper: Mapper, folder: Path) -> None:
             view = mapper.render(state.sequence.camera, trajectory.pose(k))
             yield np.where(view.alpha > 0.9, view.depth, 0), view.intensity, trajectory.pose(k)
 
-    write_mesh(folder / "mesh.ply", fuse_mesh(views(), state.sequence.camera, MESH_VOXEL))
+    try:
+        write_mesh(folder / "mesh.ply", fuse_mesh(views(), state.sequence.camera, MESH_VOXEL))
+    except DataError as error:  # a map too thin for a surface: the other results stand
+        state.note(str(error))
 
 
 def _evenly(count: int, most: int) -> list[int]:
