@@ -44,7 +44,7 @@ class TrackingConfig(Stage):
     """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
     surface_sigma: float = Field(0.15, gt=0)
     """Standard deviation of a time-surface residual."""
-    depth_weight: float = Field(0.3, ge=0)
+    depth_weight: float = Field(3.0, ge=0)
     """Weight of the depth residual beside the time surface; 0: Eq. 5 alone."""
     depth_sigma: float = Field(0.003, gt=0)
     """Standard deviation of depth at short range, metres."""
@@ -56,7 +56,7 @@ class TrackingConfig(Stage):
     """Pyramid levels, coarse to fine."""
     iterations: int = Field(20, ge=1)
     """At most this many Levenberg-Marquardt steps a level."""
-    min_overlap: float = Field(0.7, gt=0, lt=1)
+    min_overlap: float = Field(0.8, gt=0, lt=1)
     """Below this fraction of patch pixels seen, the frame becomes the tracker's next keyframe."""
     min_inliers: float = Field(0.3, gt=0, lt=1)
     """Below this fraction of patch pixels in agreement, tracking has failed."""

@@ -30,8 +30,13 @@ HELD_OUT_MARGIN = 0.15  # fraction of a chunk around a held-out time where no in
 class Mapper(Protocol):
     """Builds a map from tracked frames and shows it."""
 
-    num_gaussians: int  # 0 for maps of another kind
-    loss: float  # running mean of what is minimised; nan where nothing is
+    @property
+    def num_gaussians(self) -> int:
+        """Size of the map; 0 for maps of another kind."""
+
+    @property
+    def loss(self) -> float:
+        """Running mean of what is minimised; nan where nothing is."""
 
     def update(self, frame: Frame, trajectory: Trajectory) -> None:
         """Take in the newest frame, whose pose ends the trajectory; may correct earlier poses."""
