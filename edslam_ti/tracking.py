@@ -85,11 +85,15 @@ class BidirectionalPatchTracker:
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame` relative to the references' poses on the trajectory."""
         current = self._with_patches(frame)
-        can_be_reference = frame.depth is not None and (current.has_surface or self._model.depth_weight > 0)
+        has_depth = frame.depth is not None and bool((frame.depth > 0).any())
+        can_be_aligned = current.has_surface or (has_depth and self._model.depth_weight > 0)
+        can_be_reference = can_be_aligned and frame.depth is not None
         if self._keyframe is None:
             if can_be_reference:
                 self._keyframe = self._previous = current
             return TrackingResult(guess, True, 1.0)
+        if not can_be_aligned:
+            return TrackingResult(guess, False, 0.0, "too few events, and no depth to align instead")
         result, overlap = self._track(current, guess, trajectory)
         if can_be_reference:
             if overlap < self._config.min_overlap or not result.converged:

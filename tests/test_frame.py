@@ -1,0 +1,64 @@
+"""Samples become frames: time surface with memory, and a pyramid that mixes no surfaces."""
+
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.config import TimeSurfaceConfig
+from edslam_ti.datasets import Sample
+from edslam_ti.events import Events
+from edslam_ti.frame import Frame, FrameBuilder
+
+CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
+SHARP = TimeSurfaceConfig(decay=0.1, blur=0)
+
+
+def one_event(x: int, y: int, t: float) -> Events:
+    return Events(np.array([x], np.int16), np.array([y], np.int16), np.array([t]), np.array([1], np.int8))
+
+
+def frame(surface: np.ndarray | None = None, depth: np.ndarray | None = None) -> Frame:
+    zeros = np.zeros(CAMERA.shape, np.float32)
+    return Frame(0.1, 0.0, Events.empty(), CAMERA, zeros if surface is None else surface, depth, None)
+
+
+def test_surface_remembers_events_of_earlier_samples() -> None:
+    builder = FrameBuilder(CAMERA, SHARP)
+    builder.build(Sample(0.05, one_event(2, 1, 0.04), depth=None))
+    later = builder.build(Sample(0.15, one_event(5, 3, 0.12), depth=None))
+    np.testing.assert_allclose(later.surface[1, 2], np.exp(-1.1), rtol=1e-5)
+    np.testing.assert_allclose(later.surface[3, 5], np.exp(-0.3), rtol=1e-5)
+    assert np.count_nonzero(later.surface) == 2
+
+
+def test_chunk_begins_where_the_last_one_ended() -> None:
+    builder = FrameBuilder(CAMERA, SHARP)
+    first = builder.build(Sample(0.05, Events.empty(), depth=None))
+    second = builder.build(Sample(0.15, Events.empty(), depth=None), is_held_out=True)
+    assert (first.previous_timestamp, second.previous_timestamp) == (0.05, 0.05)
+    assert (first.is_held_out, second.is_held_out) == (False, True)
+
+
+def test_blur_spreads_an_event_and_keeps_its_sum() -> None:
+    blurred = FrameBuilder(CAMERA, TimeSurfaceConfig(decay=0.1, blur=0.6)).build(
+        Sample(0.05, one_event(4, 3, 0.05 - 1e-9), depth=None)
+    )
+    assert 0 < blurred.surface[3, 5] < blurred.surface[3, 4] < 1
+    np.testing.assert_allclose(blurred.surface.sum(), 1.0, rtol=0.01)  # borders reflect a little of it
+
+
+def test_pyramid_halves_the_image_and_its_camera() -> None:
+    surface = np.random.default_rng(0).random(CAMERA.shape, np.float32)
+    level = frame(surface).level(1)
+    assert (level.camera.width, level.camera.height, level.camera.fx) == (4, 3, 5.0)
+    np.testing.assert_allclose(level.surface[1, 2], surface[2:4, 4:6].mean(), rtol=1e-6)
+    assert (level.depth == 0).all()  # no depth image: missing everywhere
+
+
+def test_pyramid_leaves_out_depth_across_an_edge_or_a_hole() -> None:
+    depth = np.full(CAMERA.shape, 2.0, np.float32)
+    depth[0, 0] = 0  # a hole
+    depth[2, 2] = 2.2  # 10 % farther: an edge
+    depth[4, 4] = 2.04  # 2 %: the same surface
+    reduced = frame(depth=depth).level(1).depth
+    assert (reduced[0, 0], reduced[1, 1]) == (0, 0)
+    np.testing.assert_allclose([reduced[2, 2], reduced[0, 1]], [2.01, 2.0], rtol=1e-6)
