@@ -78,11 +78,11 @@ class MappingConfig(Stage):
 
     enabled: bool = True
     """False: track only, build no map."""
-    iterations: int = Field(20, ge=0)
+    iterations: int = Field(5, ge=0)
     """Optimisation steps after each frame."""
-    initial_iterations: int = Field(100, ge=0)
+    initial_iterations: int = Field(50, ge=0)
     """Steps after the first keyframe has seen some motion."""
-    final_iterations: int = Field(400, ge=0)
+    final_iterations: int = Field(800, ge=0)
     """Steps over all keyframes after the last frame."""
     reduced_share: float = Field(0.5, ge=0, le=1)
     """Share of the steps that work on images of half the size, at a third of the cost."""

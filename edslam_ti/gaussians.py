@@ -91,7 +91,7 @@ class GaussianMap:
             "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(m, 1),
             "log_scales": scales.log(),
             "logit_opacities": torch.full((m,), opacity).logit(),
-            "logit_colors": colors.clamp(0.0001, 0.9999).logit() - shared,
+            "logit_colors": _logit(colors) - shared,
         }
         moments = {
             name: {key: torch.cat([value, torch.zeros_like(new[name])]) for key, value in state.items()}
@@ -108,6 +108,12 @@ class GaussianMap:
             for name, state in self._moments().items()
         }
         self._replace({name: value.detach()[mask] for name, value in self._raw.items()}, moments)
+
+    def set_colors(self, colors: Tensor) -> None:  # [N, 1] in (0, 1)
+        """Overwrite every Gaussian's brightness; the cells keep theirs."""
+        with torch.no_grad():
+            shared = self._cell_table[self._cells].sum(-1, keepdim=True)
+            self._raw["logit_colors"].copy_(_logit(colors) - shared)
 
     def step(self) -> None:
         """Take one Adam step along the gradients, and clear them."""
@@ -157,3 +163,8 @@ class GaussianMap:
         if self._steps:
             for name, value in self._raw.items():
                 self._adam.state[value] = {"step": torch.tensor(float(self._steps)), **moments[name]}
+
+
+def _logit(colors: Tensor) -> Tensor:
+    """Return the logit of brightness, at the ends of its range as far as gradients can come back from."""
+    return colors.clamp(0.002, 0.998).logit()

@@ -6,8 +6,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from edslam_ti.brightness import solve_log_brightness
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.frame import Frame
@@ -23,6 +25,7 @@ Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks
 
 REDUCTION = 2  # of the images in reduced steps: pyramid level 1
 ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
+MAX_SOLVED = 60  # frames in the least-squares solution for brightness
 MIN_CHUNKS = 3  # events of so many chunks are needed before the map's brightness can be optimised
 HELD_OUT_MARGIN = 0.15  # fraction of a chunk around a held-out time where no interval may begin or end
 
@@ -143,6 +146,7 @@ class GaussianMapper:
         steps = self._config.final_iterations
         if len(self._archive) < MIN_CHUNKS:
             return
+        self._solve_brightness(trajectory)
         for k in range(steps):
             rate = 0.05 ** (k / steps)  # ends at a twentieth
             self.gaussians.decay_rates(rate)
@@ -230,6 +234,31 @@ class GaussianMapper:
             self.gaussians.keep(keep)
 
     # --- optimising ---
+
+    def _solve_brightness(self, trajectory: Trajectory) -> None:
+        """Set every Gaussian's brightness from all events at once; see brightness.py."""
+        eligible = [c for c in range(len(self._archive)) if c not in self._held_out]
+        chosen = [eligible[int(k)] for k in np.linspace(0, len(eligible) - 1, min(len(eligible), MAX_SOLVED))]
+        with torch.no_grad():
+            gaussians = self.gaussians.activated()
+            seen = [
+                self._render(gaussians, torch.from_numpy(trajectory.pose(c))).dominant.numpy().ravel()
+                for c in chosen
+            ]
+        sums = [self._archive.sum_before(c, 0).ravel() for c in chosen]
+        epsilon = self._config.log_epsilon
+        prior = np.log(gaussians.colors.detach().numpy()[:, 0].astype(np.float64) + epsilon)
+        level = solve_log_brightness(
+            np.array(seen), np.array(sums, np.float32) * self._contrast_threshold, prior
+        )
+        observed = np.zeros(len(prior), bool)
+        observed[np.unique(np.array(seen))[1:]] = True
+        if 0 < observed.sum() < len(prior):  # those never in front follow their neighbours
+            means = gaussians.means.detach().numpy()
+            _, nearest = cKDTree(means[observed]).query(means[~observed], k=3)
+            level[~observed] = level[observed][nearest].mean(-1)
+        brightness = np.exp(level) - epsilon
+        self.gaussians.set_colors(torch.from_numpy(brightness.astype(np.float32))[:, None])
 
     def _reduction(self) -> int:
         """Draw the size of the next step's images: reduced ones cost a third and settle large surfaces."""

@@ -23,6 +23,7 @@ class RenderOutput:
     depth: Tensor  # [H, W] metres, weighted by alpha (Eq. 8)
     alpha: Tensor  # [H, W]
     visible: Tensor  # [N] bool, Sec. III-E
+    dominant: Tensor  # [H, W] int32, the Gaussian seen at each pixel, -1 where there is none
 
     @property
     def expected_depth(self) -> Tensor:
@@ -61,7 +62,7 @@ def render(
         low_pass=reduced_low_pass(reduction),
     )
     intensity = drawn.image[..., 0] + (1 - drawn.alpha) * background
-    return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible)
+    return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible, drawn.dominant)
 
 
 def reduced_low_pass(reduction: int) -> float:

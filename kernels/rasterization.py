@@ -166,6 +166,7 @@ def _rasterize_forward(
     transmittance: ti.types.ndarray(ndim=2),  # [H, W]
     last: ti.types.ndarray(ti.i32, ndim=2),  # [H, W] last pair that was drawn
     visible: ti.types.ndarray(ti.u8, ndim=1),  # [N] zeros in, 1 where drawn at T > 0.5
+    dominant: ti.types.ndarray(ti.i32, ndim=2),  # [H, W] Gaussian at which T falls below 0.5, -1: none
     C: ti.template(),
 ):
     height, width = depth.shape[0], depth.shape[1]
@@ -181,6 +182,7 @@ def _rasterize_forward(
                         transmittance[y, x] = 1.0
                         depth[y, x] = 0.0
                         last[y, x] = -1
+                        dominant[y, x] = -1
                         for k in ti.static(range(C)):
                             image[y, x, k] = 0.0
                 for pair in range(tile_start[t], tile_start[t + 1]):
@@ -212,6 +214,8 @@ def _rasterize_forward(
                                 last[y, x] = pair
                                 if T > VISIBLE_TRANSMITTANCE:
                                     seen = 1
+                                    if T - weight <= VISIBLE_TRANSMITTANCE:
+                                        dominant[y, x] = g
                     if seen == 1:
                         visible[g] = ti.cast(1, ti.u8)
                 t = ti.atomic_add(next_tile[0], 1)
@@ -329,6 +333,7 @@ class Rasterization:
     depth: Tensor  # [H, W] metres, weighted by alpha (Eq. 8)
     alpha: Tensor  # [H, W]
     visible: Tensor  # [N] bool
+    dominant: Tensor  # [H, W] int32, index of the Gaussian at half the opacity; -1 where there is none
 
 
 class _Rasterize(torch.autograd.Function):
@@ -371,19 +376,20 @@ class _Rasterize(torch.autograd.Function):
         image, depth = floats(height, width, channels), floats(height, width)
         transmittance, last = floats(height, width), integers(height, width)
         visible = torch.zeros(n, dtype=torch.uint8, device=device)
+        dominant = integers(height, width)
         queue = torch.zeros(1, dtype=torch.int32, device=device)
         _rasterize_forward(
             record, colors_, tile_start, gaussian, tile, workers(), queue,
-            image, depth, transmittance, last, visible, channels,
+            image, depth, transmittance, last, visible, dominant, channels,
         )  # fmt: skip
         ctx.save_for_backward(*inputs, record, tile_start, first_slot, gaussian, slot, transmittance, last)
         ctx.intrinsics, ctx.tile = intrinsics, tile
         visible = visible.bool()
-        ctx.mark_non_differentiable(visible)
-        return image, depth, 1 - transmittance, visible
+        ctx.mark_non_differentiable(visible, dominant)
+        return image, depth, 1 - transmittance, visible, dominant
 
     @staticmethod
-    def backward(ctx, grad_image, grad_depth, grad_alpha, _):
+    def backward(ctx, grad_image, grad_depth, grad_alpha, _visible, _dominant):
         (
             means, quats, scales, _, colors, pose,
             record, tile_start, first_slot, gaussian, slot, transmittance, last,

@@ -139,11 +139,14 @@ def rasterize(
     weights = alpha * T[:, :-1]
     visible = torch.zeros(n, dtype=torch.bool)
     visible[index] = ((alpha > 0) & (T[:, :-1] > VISIBLE_TRANSMITTANCE)).any(0)
+    is_half = (T[:, :-1] > VISIBLE_TRANSMITTANCE) & (T[:, 1:] <= VISIBLE_TRANSMITTANCE)  # at most one a row
+    dominant = torch.where(is_half.any(1), index[is_half.int().argmax(1)], -1).int()
     return Rasterization(
         (weights @ colors[index]).view(height, width, -1),
         (weights @ depths[order]).view(height, width),
         (1 - T[:, -1]).view(height, width),
         visible,
+        dominant.view(height, width),
     )
 
 

@@ -44,6 +44,7 @@ def test_rendering_and_all_gradients_match_the_torch_twin(channels: int) -> None
         assert difference.mean() < tolerance, name
         assert difference.max() < 2e-2, name
     assert (ours.visible == twin.visible).float().mean() > 0.99
+    assert (ours.dominant == twin.dominant).float().mean() > 0.99
     cotangents = [torch.randn(x.shape, generator=torch.Generator().manual_seed(k), dtype=torch.float64)
                   for k, x in enumerate((twin.image, twin.depth, twin.alpha))]  # fmt: skip
     ours_loss = sum(
