@@ -1,0 +1,240 @@
+"""The mapper: where Gaussians are added, what they are optimised for, and what is never looked at."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from sequences import make_slam, settings
+
+from edslam_ti.datasets import EventDepthSequence, Sample
+from edslam_ti.evaluation import evaluate_images
+from edslam_ti.mapping import GaussianMapper, PoseRefiner, block_means, densify_mask
+from edslam_ti.slam import Slam
+from edslam_ti.trajectory import Trajectory
+
+FEW = {"iterations": 1, "initial_iterations": 3, "final_iterations": 3}
+
+
+def mapped(
+    sequence: EventDepthSequence,
+    samples: list[Sample],
+    held_out: set[int] | None = None,
+    poses: str = "truth",
+    finish: bool = True,
+    **mapping: Any,
+) -> tuple[Slam, GaussianMapper]:
+    """Return a run over the samples, and its mapper."""
+    slam = make_slam(sequence, samples, settings(poses=poses, mapping=FEW | mapping))
+    for k, sample in enumerate(samples):
+        slam.process(sample, is_held_out=k in (held_out or set()))
+    assert isinstance(slam.mapper, GaussianMapper)
+    if finish:
+        slam.mapper.finish(slam.trajectory, lambda fraction: True)
+    return slam, slam.mapper
+
+
+def corrected_psnr(mapper: GaussianMapper, slam: Slam, samples: list[Sample], indices: list[int]) -> float:
+    """Return the PSNR in dB of views after EventNeRF's fit."""
+    views = [mapper.render(mapper._camera, slam.trajectory.pose(k)).intensity for k in indices]
+    truths = [image for k in indices if (image := samples[k].image) is not None]
+    measured = evaluate_images(views, truths, [np.ones(t.shape, bool) for t in truths])
+    assert measured.psnr_corrected_db is not None
+    return measured.psnr_corrected_db
+
+
+# --- what it achieves ---
+
+
+def test_mapping_raises_the_psnr_of_held_out_views(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    held_out = {3, 8, 12}
+    untouched: dict[str, Any] = {"iterations": 0, "initial_iterations": 0, "final_iterations": 0}
+    slam, blank = mapped(tiny_sequence, tiny_samples, held_out, finish=False, **untouched)
+    before = corrected_psnr(blank, slam, tiny_samples, sorted(held_out))
+    steps = {"iterations": 8, "initial_iterations": 40, "final_iterations": 50}
+    slam, mapper = mapped(tiny_sequence, tiny_samples, held_out, **steps)
+    after = corrected_psnr(mapper, slam, tiny_samples, sorted(held_out))
+    assert after > before + 5  # 13 dB to 22 dB was measured
+    assert after > 18
+    assert mapper.loss < 0.5
+
+
+def test_map_is_the_same_twice_to_the_last_bit(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    a, b = (mapped(tiny_sequence, tiny_samples[:6], poses="tracked") for _ in range(2))
+    for name, values in a[1].gaussians.raw.items():
+        assert (values == b[1].gaussians.raw[name]).all(), name
+    assert (a[0].trajectory.poses == b[0].trajectory.poses).all()
+
+
+# --- what it never looks at ---
+
+
+def test_depth_of_held_out_frames_is_never_used(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    samples, held_out = tiny_samples[:8], {2, 5}
+    poisoned = list(samples)
+    for k in held_out:
+        depth = samples[k].depth
+        assert depth is not None
+        poisoned[k] = replace(samples[k], depth=0.5 * depth)
+    (_, clean), (_, other) = (mapped(tiny_sequence, s, held_out) for s in (samples, poisoned))
+    assert clean.num_gaussians == other.num_gaussians
+    for name, values in clean.gaussians.raw.items():
+        assert (values == other.gaussians.raw[name]).all(), name
+
+
+def test_images_are_never_used(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    samples = tiny_samples[:6]
+    blind = [replace(s, image=None) for s in samples]
+    (_, clean), (_, other) = (mapped(tiny_sequence, s, poses="tracked") for s in (samples, blind))
+    assert (clean.gaussians.raw["logit_colors"] == other.gaussians.raw["logit_colors"]).all()
+
+
+def test_intervals_never_begin_or_end_near_held_out_times(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    held_out = {3, 8, 12}
+    slam, mapper = mapped(tiny_sequence, tiny_samples, held_out, finish=False)
+    forbidden = slam.trajectory.timestamps[sorted(held_out)]
+    lengths = []
+    for _ in range(500):
+        edges = mapper._draw_interval(newest_share=0.4)
+        start, end = (mapper._archive.edges[chunk][b] for chunk, b in edges)
+        for t in (start, end):
+            assert np.abs(t - forbidden).min() > 0.007  # 15 % of a chunk of 50 ms
+        lengths.append(end - start)
+    assert min(lengths) > 0
+    assert min(lengths) < 0.03  # short ones for detail
+    assert max(lengths) > 0.4  # long ones for large surfaces
+
+
+# --- growing and pruning ---
+
+
+def test_densify_mask_is_the_truth_table_of_eq_13() -> None:
+    depth = np.array([[2.0, 2.0, 2.0, 0.0, 2.0, 2.0]])
+    alpha = np.array([[0.9, 0.7, 0.9, 0.1, 0.9, 0.9]])
+    rendered = np.array([[2.01, 2.0, 3.0, 0.0, 2.01, 2.01]])
+    mask = densify_mask(alpha, rendered, depth, min_visibility=0.8, depth_error_factor=50.0)
+    # well seen | transparent | 100 times the median error | nothing measured | well seen ...
+    assert mask.tolist() == [[False, True, True, False, False, False]]
+
+
+def test_empty_map_needs_gaussians_wherever_there_is_depth() -> None:
+    depth = np.array([[1.0, 0.0], [2.0, 3.0]])
+    nothing = np.zeros_like(depth)
+    assert (densify_mask(nothing, nothing, depth, 0.8, 50.0) == (depth > 0)).all()
+    assert not densify_mask(nothing, nothing, nothing, 0.8, 50.0).any()
+
+
+def test_mapped_pixels_get_no_second_gaussians(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, first = mapped(tiny_sequence, tiny_samples[:1])
+    assert first.num_gaussians == 120 * 80 / 4
+    _, all_of_them = mapped(tiny_sequence, tiny_samples, iterations=0, initial_iterations=0)
+    # 14 views of nearly the same walls: what is new is the rim and behind edges.
+    assert first.num_gaussians < all_of_them.num_gaussians < 2 * first.num_gaussians
+
+
+def test_map_never_exceeds_its_largest_size(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:6], max_gaussians=1500)
+    assert 1000 < mapper.num_gaussians <= 1500
+
+
+def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:5], finish=False)
+    before = mapper.num_gaussians
+    logits = mapper.gaussians.raw["logit_opacities"]
+    logits.data[:100] = -10.0
+    mapper.finish(slam.trajectory, lambda fraction: True)
+    assert before - 150 < mapper.num_gaussians <= before - 100
+
+
+def test_first_frame_and_distant_frames_are_keyframes(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples, held_out={7})
+    indices = [k.index for k in mapper.keyframes]
+    assert indices[0] == 0
+    assert 2 <= len(indices) < len(tiny_samples) / 2  # 22 cm at a depth of 1.6 m, one every 8 cm
+    assert 7 not in indices
+
+
+# --- poses ---
+
+
+def test_bundle_adjustment_moves_tracked_poses_but_not_the_first(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:6], poses="tracked", finish=False)
+    before = slam.trajectory.poses
+    mapper._config = mapper._config.model_copy(update={"final_iterations": 20})
+    mapper.finish(slam.trajectory, lambda fraction: True)
+    moved = np.linalg.norm(slam.trajectory.poses[:, :3, 3] - before[:, :3, 3], axis=1)
+    assert moved[0] == 0  # the gauge
+    assert 0 < moved[1:].max() < 0.001  # at most 20 steps of 20 um a coordinate
+
+
+def test_true_poses_are_not_adjusted(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    slam, _ = mapped(tiny_sequence, tiny_samples[:6], final_iterations=6)
+    truth = np.array([s.T_world_camera for s in tiny_samples[:6]])
+    assert (slam.trajectory.poses == truth).all()
+
+
+def test_pose_refiner_descends_by_its_rate_in_the_camera_frame() -> None:
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # the camera's x is the world's y
+    trajectory = Trajectory(np.array([0.0, 1.0]), np.stack([np.eye(4), T]))
+    PoseRefiner(rate=1e-3).step(1, np.array([5.0, 0, 0, 0, 0, 0]), trajectory)
+    np.testing.assert_allclose(trajectory.pose(1)[:3, 3], [0, -1e-3, 0], atol=1e-9)
+    assert (trajectory.pose(0) == np.eye(4)).all()
+
+
+def test_finish_stops_when_asked_to(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:5], finish=False, final_iterations=1000)
+    told: list[float] = []
+
+    def stop_at_third(fraction: float) -> bool:
+        told.append(fraction)
+        return len(told) < 3
+
+    mapper.finish(slam.trajectory, stop_at_third)
+    assert told == pytest.approx([0.001, 0.002, 0.003])
+
+
+# --- input that fails ---
+
+
+def test_run_without_any_depth_makes_no_map_and_no_error(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    zeros = np.zeros(tiny_sequence.camera.shape, np.float32)
+    _, mapper = mapped(tiny_sequence, [replace(s, depth=zeros) for s in tiny_samples[:6]])
+    assert mapper.num_gaussians == 0
+    assert mapper.points()[0].shape == (0, 3)
+    view = mapper.render(tiny_sequence.camera, np.eye(4))
+    assert (view.alpha == 0).all()
+
+
+def test_depth_image_of_zeros_and_frames_without_depth_are_passed_over(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    zeros = np.zeros(tiny_sequence.camera.shape, np.float32)
+    samples = [replace(s, depth=[s.depth, zeros, None][k % 3]) for k, s in enumerate(tiny_samples[:7])]
+    _, mapper = mapped(tiny_sequence, samples)
+    assert mapper.num_gaussians >= 120 * 80 / 4
+    assert np.isfinite(mapper.loss)
+
+
+def test_block_means_cut_odd_edges() -> None:
+    image = np.arange(15, dtype=np.float32).reshape(3, 5)
+    np.testing.assert_array_equal(block_means(image, 2), [[3.0, 5.0]])
+    assert block_means(image, 1) is image
