@@ -62,9 +62,14 @@ class TsdfVolume:
             "depth_max": self.max_depth,
             "trunc_voxel_multiplier": TRUNCATION_VOXELS,
         }
-        blocks = self._grid.compute_unique_block_coordinates(
-            depth_image, self._pixel_rays, T_camera_world, **limits
-        )
+        try:
+            blocks = self._grid.compute_unique_block_coordinates(
+                depth_image, self._pixel_rays, T_camera_world, **limits
+            )
+        except RuntimeError as error:  # it looks at every fourth pixel, and none of them has depth
+            if "No block is touched" not in str(error):
+                raise
+            return
         lookup = self._pixel_lookup
         self._grid.integrate(blocks, depth_image, color_image, lookup, lookup, T_camera_world, **limits)
         self.num_frames += 1

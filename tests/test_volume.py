@@ -107,3 +107,13 @@ def test_kinect_frames_with_true_poses_fuse_into_one_surface(shared_data: Path) 
     # Kinect noise is 1-2 cm at 2-3 m; the surface must agree within a voxel.
     assert np.median(np.abs(seen - depth)[both]) < 0.03
     assert np.corrcoef(brightness[both], grey[both])[0, 1] > 0.9
+
+
+def test_view_with_hardly_any_depth_is_passed_over() -> None:
+    # Open3D looks for surfaces at every fourth pixel, and calls finding none an error.
+    depth = np.zeros(CAMERA.shape)
+    depth[41, 42] = 1.5
+    volume = TsdfVolume(CAMERA, voxel_size=0.02)
+    volume.integrate(depth, depth, np.eye(4))
+    assert volume.num_frames == 0
+    assert len(volume.mesh().triangles) == 0

@@ -1,0 +1,326 @@
+"""Whole runs on the tiny room, from a folder of events and depth to a folder of results."""
+
+import io
+import json
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from sequences import settings
+
+from edslam_ti import pipeline
+from edslam_ti.command_line import launch
+from edslam_ti.config import Config
+from edslam_ti.datasets import Sample
+from edslam_ti.errors import DataError
+from edslam_ti.export import read_gaussian_ply
+from edslam_ti.pipeline import held_out_frames, run
+from edslam_ti.slam import Slam
+from edslam_ti.tracking import TrackingResult
+from edslam_ti.trajectory import read_tum
+
+FEW = {"iterations": 1, "initial_iterations": 10, "final_iterations": 10}
+ARTEFACTS = {
+    *("trajectory_tum.txt", "truth_tum.txt", "trajectory.png", "map.ply", "mesh.ply", "points.ply"),
+    *("config.yaml", "metrics.json", "log.txt", "renders"),
+}
+KEYS = {
+    *("dataset", "scene", "method", "ate_rmse_cm", "ate_mean_cm", "ate_rmse_sim3_cm", "rpe_trans_cm"),
+    *("rpe_rot_deg", "psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "depth_l1_cm"),
+    *("num_frames", "num_lost_frames", "num_gaussians", "num_events", "tracking_hz", "total_fps"),
+    *("wall_s", "peak_memory_mb", "device", "protocol"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def taichi_is_started_once() -> Any:
+    """Runs start Taichi themselves, which recompiles every kernel; here it runs already."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline.kernels, "init", lambda *arguments, **options: None)
+        yield
+
+
+def config_for(recording: Path, out: Path, method: str = "ed_slam", **differences: Any) -> Config:
+    """Return quick settings for a recording."""
+    mapping = FEW | differences.pop("mapping", {})
+    places = {"scene": recording.name, "dataset": "event_replica", "data_dir": recording.parent, "out": out}
+    return settings(method, **places, mapping=mapping, **differences)
+
+
+def quiet_run(config: Config) -> Path:
+    return run(config, Console(file=io.StringIO()))
+
+
+def metrics_of(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def leftovers(out: Path) -> list[Path]:
+    return [p for p in out.rglob("*") if "partial" in p.name or p.name.endswith(".old")]
+
+
+@pytest.fixture(scope="module")
+def result(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return quiet_run(config_for(tiny_folder, tmp_path_factory.mktemp("results")))
+
+
+@pytest.fixture
+def recording(tiny_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the recording to be changed."""
+    return Path(shutil.copytree(tiny_folder, tmp_path / "data" / "changed"))
+
+
+# --- what a run leaves behind ---
+
+
+def test_every_artefact_is_there_and_holds_something(result: Path) -> None:
+    assert {path.name for path in result.iterdir()} == ARTEFACTS
+    assert all(path.stat().st_size > 0 for path in result.iterdir())
+    assert result.parts[-4:-1] == ("event_replica", "tiny", "ed_slam")
+    assert leftovers(result.parents[3]) == []
+
+
+def test_latest_points_to_the_result(result: Path) -> None:
+    latest = result.parent / "latest"
+    assert latest.is_symlink()
+    assert latest.resolve() == result.resolve()
+    assert not latest.readlink().is_absolute()  # results may be moved
+
+
+def test_metrics_have_every_key_and_are_right(result: Path) -> None:
+    metrics = metrics_of(result)
+    assert metrics.keys() >= KEYS
+    assert (metrics["dataset"], metrics["scene"], metrics["method"]) == ("event_replica", "tiny", "ed_slam")
+    assert metrics["num_frames"] == 14
+    assert metrics["num_lost_frames"] == 0
+    assert metrics["num_events"] > 50_000
+    assert metrics["num_gaussians"] >= 2400
+    assert metrics["ate_rmse_cm"] < 0.2
+    assert metrics["path_length_m"] == pytest.approx(0.2, abs=0.05)
+    assert 10 < metrics["psnr_corrected_db"] < 40
+    assert 0 < metrics["depth_l1_cm"] < 20
+    assert metrics["num_held_out_views"] == 3
+    numbers = KEYS - {"dataset", "scene", "method", "device", "protocol", "lpips_corrected"}
+    assert all(isinstance(metrics[key], int | float) for key in numbers)
+    assert not metrics["is_interrupted"]
+
+
+def test_trajectory_and_truth_have_a_pose_per_frame(result: Path) -> None:
+    estimate, truth = (read_tum(result / name) for name in ("trajectory_tum.txt", "truth_tum.txt"))
+    assert len(estimate) == 14
+    np.testing.assert_allclose(estimate.timestamps, truth.timestamps)
+    np.testing.assert_allclose(estimate.poses[:, :3, 3], truth.poses[:, :3, 3], atol=0.005)
+
+
+def test_map_holds_the_gaussians_that_were_counted(result: Path) -> None:
+    splats = read_gaussian_ply(result / "map.ply")
+    assert len(splats["means"]) == metrics_of(result)["num_gaussians"]
+    low, high = splats["means"].min(0), splats["means"].max(0)
+    assert (low > -0.2).all()  # the room: 3 m x 3 m x 2.4 m
+    assert (high < [3.2, 3.2, 2.6]).all()
+
+
+def test_renders_are_of_held_out_views(result: Path) -> None:
+    names = sorted(path.name for path in (result / "renders").iterdir())
+    assert names == ["000150.png", "000400.png", "000650.png"]  # ms; every fifth from the third on
+    picture = cv2.imread(str(result / "renders" / names[0]))
+    assert picture.shape[1] > 3 * 120  # render | truth | depth
+
+
+def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
+    values = yaml.safe_load((result / "config.yaml").read_text())
+    again = quiet_run(Config().updated(values | {"out": str(tmp_path)}))
+    for name in ("trajectory_tum.txt", "map.ply"):
+        assert (again / name).read_bytes() == (result / name).read_bytes(), name
+
+
+def test_log_says_what_was_run(result: Path) -> None:
+    lines = (result / "log.txt").read_text().splitlines()
+    assert lines[0].endswith("tiny")  # the sequence's folder
+    assert lines[-1].endswith("saved")
+
+
+def test_two_results_of_one_second_do_not_meet(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a-2").mkdir()
+    assert pipeline._unused(tmp_path / "a") == tmp_path / "a-3"
+    assert pipeline._unused(tmp_path / "b") == tmp_path / "b"
+
+
+def test_held_out_frames_have_depth_and_are_never_the_first() -> None:
+    class Samples:
+        has_depth = np.array([True, False, True, True, False, True, True, True])
+
+    assert held_out_frames(Samples(), 3) == {2, 6}  # type: ignore[arg-type]
+
+
+# --- other methods and settings ---
+
+
+def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None:
+    folder = quiet_run(config_for(tiny_folder, tmp_path, mapping={"enabled": False}))
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply", "mesh.ply", "points.ply", "renders"}
+    metrics = metrics_of(folder)
+    assert metrics["ate_rmse_cm"] < 0.2
+    assert metrics["psnr_corrected_db"] is None
+    assert metrics["num_gaussians"] == 0
+
+
+def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_path: Path) -> None:
+    folder = quiet_run(config_for(tiny_folder, tmp_path, "open3d_rgbd"))
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply"}  # it has no Gaussians
+    metrics = metrics_of(folder)
+    assert metrics["method"] == "open3d_rgbd"
+    assert metrics["ate_rmse_cm"] < 3
+    assert metrics["psnr_db"] > 15  # it fuses the images themselves
+
+
+def test_paper_method_runs_by_its_name(tiny_folder: Path, tmp_path: Path) -> None:
+    folder = quiet_run(config_for(tiny_folder, tmp_path, "ed_slam_paper", mapping={"enabled": False}))
+    assert folder.parent.name == "ed_slam_paper"
+    assert yaml.safe_load((folder / "config.yaml").read_text())["tracking"]["depth_weight"] == 0
+
+
+def test_true_poses_have_no_error(tiny_folder: Path, tmp_path: Path) -> None:
+    folder = quiet_run(config_for(tiny_folder, tmp_path, poses="truth"))
+    metrics = metrics_of(folder)
+    assert metrics["ate_rmse_cm"] == 0
+    assert "poses truth" in metrics["protocol"]
+
+
+def test_lpips_weights_give_a_perceptual_distance(
+    tiny_folder: Path, tmp_path: Path, shared_data: Path
+) -> None:
+    weights = next((shared_data / "lpips").glob("*.pt*"), None)
+    if weights is None:
+        pytest.skip(f"no weights in {shared_data / 'lpips'}")
+    evaluation = {"lpips_weights": str(weights), "max_images": 1}
+    folder = quiet_run(config_for(tiny_folder, tmp_path, evaluation=evaluation, duration=0.3))
+    assert 0 < metrics_of(folder)["lpips_corrected"] < 1.5
+
+
+# --- data that lacks something ---
+
+
+def test_recording_of_events_and_depth_alone_runs_without_metrics(recording: Path, tmp_path: Path) -> None:
+    shutil.rmtree(recording / "images")
+    for name in ("poses_ts.txt", "traj.txt"):
+        (recording / name).unlink()
+    folder = quiet_run(config_for(recording, tmp_path))
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"truth_tum.txt"}
+    metrics = metrics_of(folder)
+    for key in ("ate_rmse_cm", "ate_rmse_sim3_cm", "rpe_trans_cm", "psnr_db", "ssim_corrected"):
+        assert metrics[key] is None, key
+    assert metrics["depth_l1_cm"] > 0  # depth is there to compare with
+    start = read_tum(folder / "trajectory_tum.txt").pose(0)
+    np.testing.assert_allclose(start, np.eye(4), atol=1e-9)  # the world is the first camera
+
+
+def test_true_poses_without_truth_are_an_error(recording: Path, tmp_path: Path) -> None:
+    for name in ("poses_ts.txt", "traj.txt"):
+        (recording / name).unlink()
+    with pytest.raises(DataError, match="--poses truth needs true poses"):
+        quiet_run(config_for(recording, tmp_path / "out", poses="truth"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_depth_that_is_all_zero_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
+    for path in (recording / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((80, 120), np.uint16))
+    folder = quiet_run(config_for(recording, tmp_path))
+    assert not (folder / "map.ply").exists()
+    assert "the map is empty" in (folder / "log.txt").read_text()
+    assert len(read_tum(folder / "trajectory_tum.txt")) == 14
+    metrics = metrics_of(folder)
+    assert metrics["num_lost_frames"] == 13  # nothing to align to
+    assert metrics["depth_l1_cm"] is None
+
+
+def test_map_without_a_surface_keeps_its_other_results(tiny_folder: Path, tmp_path: Path) -> None:
+    folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.3, mapping={"max_gaussians": 2}))
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"mesh.ply"}
+    assert "mesh.ply: no surface" in (folder / "log.txt").read_text()
+
+
+# --- runs that end early ---
+
+
+def interrupt_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Press Ctrl-C while a frame is processed."""
+    process: Callable[..., TrackingResult] = Slam.process
+
+    def processed(self: Slam, sample: Sample, is_held_out: bool = False) -> TrackingResult:
+        if len(self.results) == frame:
+            signal.raise_signal(signal.SIGINT)
+        return process(self, sample, is_held_out)
+
+    monkeypatch.setattr(Slam, "process", processed)
+
+
+def test_interrupt_saves_what_there_is_and_exits_130(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    interrupt_at(5, monkeypatch)
+    config = config_for(tiny_folder, tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        launch(lambda: run(config))
+    assert stop.value.code == 130
+    assert "saving what there is" in capsys.readouterr().out
+    folder = (tmp_path / "event_replica/tiny/ed_slam/latest").resolve()
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS
+    metrics = metrics_of(folder)
+    assert metrics["is_interrupted"]
+    assert metrics["num_frames"] == 6  # the frame in hand is finished
+    assert len(read_tum(folder / "trajectory_tum.txt")) == 6
+    assert "interrupted" in (folder / "log.txt").read_text()
+    assert leftovers(tmp_path) == []
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_interrupt_while_refining_stops_it(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = pipeline.GaussianMapper.finish
+
+    def finish(self: Any, trajectory: Any, progress: Callable[[float], bool]) -> None:
+        signal.raise_signal(signal.SIGINT)
+        original(self, trajectory, progress)
+
+    monkeypatch.setattr(pipeline.GaussianMapper, "finish", finish)
+    config = config_for(tiny_folder, tmp_path, duration=0.3, mapping={"final_iterations": 100_000})
+    with pytest.raises(KeyboardInterrupt):
+        quiet_run(config)
+    assert metrics_of(tmp_path / "event_replica/tiny/ed_slam/latest")["is_interrupted"]
+
+
+def test_interrupt_before_the_first_frame_leaves_nothing(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted(pipeline._Interrupt):
+        requested = True
+
+    monkeypatch.setattr(pipeline, "_Interrupt", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        quiet_run(config_for(tiny_folder, tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
+def test_failed_saving_leaves_no_half_written_folder(
+    error: BaseException, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any, **options: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(pipeline, "plot_trajectory", fail)
+    config = config_for(tiny_folder, tmp_path, duration=0.2, mapping={"enabled": False})
+    with pytest.raises(type(error)):
+        quiet_run(config)
+    assert list((tmp_path / "event_replica/tiny/ed_slam").iterdir()) == []
