@@ -252,7 +252,8 @@ class GaussianMapper:
             np.array(seen), np.array(sums, np.float32) * self._contrast_threshold, prior
         )
         observed = np.zeros(len(prior), bool)
-        observed[np.unique(np.array(seen))[1:]] = True
+        visible = np.unique(np.array(seen))
+        observed[visible[visible >= 0]] = True
         if 0 < observed.sum() < len(prior):  # those never in front follow their neighbours
             means = gaussians.means.detach().numpy()
             _, nearest = cKDTree(means[observed]).query(means[~observed], k=3)
