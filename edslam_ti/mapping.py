@@ -256,7 +256,8 @@ class GaussianMapper:
         observed[visible[visible >= 0]] = True
         if 0 < observed.sum() < len(prior):  # those never in front follow their neighbours
             means = gaussians.means.detach().numpy()
-            _, nearest = cKDTree(means[observed]).query(means[~observed], k=3)
+            neighbours = list(range(1, 1 + min(3, int(observed.sum()))))
+            _, nearest = cKDTree(means[observed]).query(means[~observed], k=neighbours)
             level[~observed] = level[observed][nearest].mean(-1)
         brightness = np.exp(level) - epsilon
         self.gaussians.set_colors(torch.from_numpy(brightness.astype(np.float32))[:, None])

@@ -149,6 +149,16 @@ def test_map_never_exceeds_its_largest_size(
     assert 1000 < mapper.num_gaussians <= 1500
 
 
+def test_map_of_a_few_gaussians_is_refined_like_any_other(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:6], finish=False, max_gaussians=4, min_opacity=0.0)
+    mapper.gaussians.raw["means"].data[1:] += 50.0  # out of sight: a single one is seen
+    mapper.finish(slam.trajectory, lambda fraction: True)
+    assert mapper.num_gaussians == 4
+    assert np.isfinite(mapper.points()[1]).all()
+
+
 def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
     slam, mapper = mapped(tiny_sequence, tiny_samples[:5], finish=False)
     before = mapper.num_gaussians
