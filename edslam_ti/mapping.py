@@ -25,6 +25,7 @@ Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks
 
 REDUCTION = 2  # of the images in reduced steps: pyramid level 1
 ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
+WHITE = 0.9  # brightness given to the brightest percent of pixels
 MAX_SOLVED = 60  # frames in the least-squares solution for brightness
 MIN_CHUNKS = 3  # events of so many chunks are needed before the map's brightness can be optimised
 HELD_OUT_MARGIN = 0.15  # fraction of a chunk around a held-out time where no interval may begin or end
@@ -259,6 +260,10 @@ class GaussianMapper:
             neighbours = list(range(1, 1 + min(3, int(observed.sum()))))
             _, nearest = cKDTree(means[observed]).query(means[~observed], k=neighbours)
             level[~observed] = level[observed][nearest].mean(-1)
+        # Events do not know the absolute level: put the brightest percent of what is seen near white.
+        in_view = level[np.array(seen)[np.array(seen) >= 0]]
+        if len(in_view):
+            level += np.log(WHITE + epsilon) - np.percentile(in_view, 99)
         brightness = np.exp(level) - epsilon
         self.gaussians.set_colors(torch.from_numpy(brightness.astype(np.float32))[:, None])
 

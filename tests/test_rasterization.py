@@ -95,7 +95,8 @@ def test_a_gaussian_peaks_at_the_pixel_it_was_seeded_from() -> None:
 
 def test_a_nearer_opaque_gaussian_hides_a_farther_one() -> None:
     means = torch.tensor([[0.0, 0, 3.0], [0.0, 0, 1.5]])
-    arguments = (torch.tensor([[1.0, 0, 0, 0]] * 2), torch.tensor([[0.02] * 3, [0.2] * 3]), torch.tensor([0.99, 0.99]),
+    arguments = (torch.tensor([[1.0, 0, 0, 0]] * 2), torch.tensor([[0.02] * 3, [0.2] * 3]),
+                 torch.tensor([0.99, 0.99]),
                  torch.tensor([[1.0], [0.0]]), torch.eye(4), INTRINSICS, SIZE)  # fmt: skip
     view = rasterize(means, *arguments)
     assert float(view.image[15, 19, 0]) < 0.02
