@@ -56,6 +56,8 @@ class CameraFile(BaseModel):
     """C of Eq. 11; also chooses among several event folders."""
     depth_scale: float = Field(1000.0, gt=0)
     """Units of depth/*.png in a metre (1000: millimetres); below 1, metres in a unit (0.001: the same)."""
+    description: str | None = None
+    """What the recording is; simulated ones say so here, and results repeat it."""
 
     @property
     def camera(self) -> Camera:
@@ -115,8 +117,8 @@ class EventReplicaSequence(EventDepthSequence):
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
-        self.description = description or f"EventReplica layout, {folder}"
         calibration = read_camera(folder / "camera.json")
+        self.description = description or calibration.description or f"EventReplica layout, {folder}"
         self.camera = calibration.camera
         self._metres_per_unit = calibration.metres_per_unit
         events_folder, self.contrast_threshold = _event_folder(
