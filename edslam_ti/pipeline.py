@@ -72,7 +72,7 @@ def run(config: Config, console: Console | None = None) -> Path:
     viewer = Viewer() if config.visualize else StubViewer()
     state = _prepare(config)
     camera, (first, last) = state.sequence.camera, state.samples.timestamps[[0, -1]]
-    state.note(state.sequence.description)
+    state.note(f"{state.sequence.scene}: {state.sequence.description}, method {config.method}")
     console.print(
         f"[bold]{state.sequence.scene}[/bold]: {state.sequence.description}\n"
         f"{camera.width}x{camera.height}, {last - first:.2f} s, {len(state.samples)} frames, "
