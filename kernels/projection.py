@@ -15,13 +15,13 @@ import taichi as ti
 NEAR = 0.05  # metres; nearer Gaussians are culled
 LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian ends where its alpha falls below this
-CULLED = 0x7FFFFFFF  # sort key of a Gaussian that is not drawn: after all others
+NOT_DRAWN = -1  # in place of the depth bits, which are positive
 
-# Columns of the projected record [N, 11]
-MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, DEPTH, EXTENT, HALF_WIDTH, HALF_HEIGHT = range(10)
-RECORD_SIZE = 10
-# Columns of the record's gradient [pairs, 7 + C]: as above up to depth, then colours
-GRADIENT_SIZE = 7
+# Columns of the projected record [N, FEATURES + 1 + C]; the features are the depth and the colours
+MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, EXTENT, HALF_WIDTH, HALF_HEIGHT, FEATURES = range(10)
+# Columns of the record's gradient [pairs, GRADIENT_FEATURES + 1 + C]: as above up to the opacity, features
+GRADIENT_FEATURES = 6
+MAX_TILES = 256  # across and down: a Gaussian's first and last tile column and row fit into one integer
 
 
 @ti.func
@@ -51,18 +51,22 @@ def load_quaternion(quats: ti.template(), i):
 
 
 @ti.func
-def tile_range(record: ti.template(), g, width, height, tile):
-    """First and last tile column and row that Gaussian g touches."""
-    u, v = record[g, MEAN_X], record[g, MEAN_Y]
-    half_width, half_height = record[g, HALF_WIDTH], record[g, HALF_HEIGHT]
-    return ti.Vector(
-        [
-            ti.max(0, ti.cast(ti.ceil(u - half_width), ti.i32)) // tile,
-            ti.min(width - 1, ti.cast(ti.floor(u + half_width), ti.i32)) // tile,
-            ti.max(0, ti.cast(ti.ceil(v - half_height), ti.i32)) // tile,
-            ti.min(height - 1, ti.cast(ti.floor(v + half_height), ti.i32)) // tile,
-        ]
-    )
+def tiles_between(low, high, size, tile):
+    """First and last tile, of a row or column of them, that holds a pixel of [low, high]."""
+    first = ti.max(0, ti.cast(ti.ceil(low), ti.i32))
+    last = ti.min(size - 1, ti.cast(ti.floor(high), ti.i32))
+    return first // tile, ti.select(first <= last, last // tile, -1)
+
+
+@ti.func
+def pack_tiles(left, right, top, bottom):
+    return (left << 24) | (right << 16) | (top << 8) | bottom
+
+
+@ti.func
+def unpack_tiles(packed):
+    """First and last tile column, first and last tile row."""
+    return (packed >> 24) & 255, (packed >> 16) & 255, (packed >> 8) & 255, packed & 255
 
 
 @ti.kernel
@@ -72,6 +76,7 @@ def _project_forward(
     quats: ti.types.ndarray(ndim=2),  # [N, 4] wxyz, any norm
     scales: ti.types.ndarray(ndim=2),  # [N, 3] metres
     opacities: ti.types.ndarray(ndim=1),  # [N]
+    colors: ti.types.ndarray(ndim=2),  # [N, C]
     T_camera_world: ti.types.ndarray(ndim=2),  # [4, 4]
     fx: float,
     fy: float,
@@ -82,13 +87,14 @@ def _project_forward(
     tile: ti.i32,
     low_pass: float,  # px^2
     # outputs
-    record: ti.types.ndarray(ndim=2),  # [N, RECORD_SIZE]
-    keys: ti.types.ndarray(ti.i64, ndim=1),  # [N] depth bits above, index below: unique, sortable
-    num_tiles: ti.types.ndarray(ti.i32, ndim=1),  # [N] tiles touched, 0 = not drawn
+    record: ti.types.ndarray(ndim=2),  # [N, FEATURES + 1 + C]
+    depth_bits: ti.types.ndarray(ti.i32, ndim=1),  # [N] sorts as the depth, NOT_DRAWN where culled
+    packed_tiles: ti.types.ndarray(ti.i32, ndim=1),  # [N] tiles touched
+    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [N + 1] slots of Gaussian i: first_slot[i] .. [i + 1]
 ):
     for i in range(means.shape[0]):
-        num_tiles[i] = 0
-        keys[i] = (ti.cast(CULLED, ti.i64) << 32) | ti.cast(i, ti.i64)
+        first_slot[i] = 0
+        depth_bits[i] = NOT_DRAWN
         R_c, t_c = load_pose(T_camera_world)
         p = R_c @ ti.Vector([means[i, 0], means[i, 1], means[i, 2]]) + t_c
         if p[2] > NEAR:
@@ -114,15 +120,27 @@ def _project_forward(
                     record[i, CONIC_XY] = -cov_xy * inv_det
                     record[i, CONIC_YY] = cov_xx * inv_det
                     record[i, OPACITY] = opacities[i]
-                    record[i, DEPTH] = p[2]
                     record[i, EXTENT] = extent
-                    record[i, HALF_WIDTH] = ti.sqrt(2 * extent * cov_xx)
-                    record[i, HALF_HEIGHT] = ti.sqrt(2 * extent * cov_yy)
-                    r = tile_range(record, i, width, height, tile)
-                    if r[0] <= r[1] and r[2] <= r[3]:
-                        num_tiles[i] = (r[1] - r[0] + 1) * (r[3] - r[2] + 1)
-                        bits = ti.bit_cast(ti.cast(p[2], ti.f32), ti.i32)  # positive floats sort as integers
-                        keys[i] = (ti.cast(bits, ti.i64) << 32) | ti.cast(i, ti.i64)
+                    half_width, half_height = ti.sqrt(2 * extent * cov_xx), ti.sqrt(2 * extent * cov_yy)
+                    record[i, HALF_WIDTH], record[i, HALF_HEIGHT] = half_width, half_height
+                    record[i, FEATURES] = p[2]
+                    for k in range(colors.shape[1]):
+                        record[i, FEATURES + 1 + k] = colors[i, k]
+                    left, right = tiles_between(u - half_width, u + half_width, width, tile)
+                    top, bottom = tiles_between(v - half_height, v + half_height, height, tile)
+                    if left <= right and top <= bottom:
+                        first_slot[i] = (right - left + 1) * (bottom - top + 1)  # the number, for now
+                        packed_tiles[i] = pack_tiles(left, right, top, bottom)
+                        # positive floats sort as integers
+                        depth_bits[i] = ti.bit_cast(ti.cast(p[2], ti.f32), ti.i32)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for i in range(means.shape[0]):
+            number = first_slot[i]
+            first_slot[i] = total
+            total += number
+        first_slot[means.shape[0]] = total
 
 
 @ti.kernel
@@ -134,9 +152,9 @@ def _project_backward(
     T_camera_world: ti.types.ndarray(ndim=2),  # [4, 4]
     fx: float,
     fy: float,
-    record: ti.types.ndarray(ndim=2),  # [N, RECORD_SIZE]
+    record: ti.types.ndarray(ndim=2),  # [N, FEATURES + 1 + C]
     first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [N + 1] slots of Gaussian i: first_slot[i] .. [i + 1]
-    slot_grad: ti.types.ndarray(ndim=2),  # [slots, GRADIENT_SIZE + C] one row per (Gaussian, tile)
+    slot_grad: ti.types.ndarray(ndim=2),  # [slots, GRADIENT_FEATURES + 1 + C] one row per (Gaussian, tile)
     # outputs
     grad_means: ti.types.ndarray(ndim=2),  # [N, 3]
     grad_quats: ti.types.ndarray(ndim=2),  # [N, 4]
@@ -153,13 +171,13 @@ def _project_backward(
         dR_c = ti.Matrix([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
         dt_c = ti.Vector([0.0, 0.0, 0.0])
         for i in range(ti.cast(n * part // parts, ti.i32), ti.cast(n * (part + 1) // parts, ti.i32)):
-            g = ti.Vector([0.0 for _ in range(GRADIENT_SIZE)])
+            g = ti.Vector([0.0 for _ in range(GRADIENT_FEATURES + 1)])
             dcolor = ti.Vector([0.0 for _ in range(C)])
             for s in range(first_slot[i], first_slot[i + 1]):
-                for k in ti.static(range(GRADIENT_SIZE)):
+                for k in ti.static(range(GRADIENT_FEATURES + 1)):
                     g[k] += slot_grad[s, k]
                 for k in ti.static(range(C)):
-                    dcolor[k] += slot_grad[s, GRADIENT_SIZE + k]
+                    dcolor[k] += slot_grad[s, GRADIENT_FEATURES + 1 + k]
             for k in ti.static(range(C)):
                 grad_colors[i, k] = dcolor[k]
             grad_opacities[i] = g[OPACITY]
@@ -204,7 +222,7 @@ def _project_backward(
                     [
                         g[MEAN_X] * fx * inv_z - dj02 * fx * inv_z2,
                         g[MEAN_Y] * fy * inv_z - dj12 * fy * inv_z2,
-                        g[DEPTH]
+                        g[GRADIENT_FEATURES]
                         - (g[MEAN_X] * fx * p[0] + g[MEAN_Y] * fy * p[1]) * inv_z2
                         - (dj00 * fx + dj11 * fy) * inv_z2
                         + 2 * inv_z3 * (fx * p[0] * dj02 + fy * p[1] * dj12),

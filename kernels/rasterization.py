@@ -3,325 +3,363 @@
     I(x) = sum_i c_i alpha_i T_i,   D(x) = sum_i d_i alpha_i T_i,   A(x) = 1 - T_end
     T_i = prod_{j<i} (1 - alpha_j),   alpha_i = o_i exp(-1/2 d_i^T K_i d_i)
 
-Gaussians are sorted by depth once and listed per tile by a stable counting pass. One worker owns a
-tile and draws Gaussian by Gaussian, row by row over the exact span of its ellipse, so that no two
-workers write the same pixel: no atomics, and the same bits at every run. The backward pass walks the
-same lists in reverse; each (Gaussian, tile) pair has a private slot for its gradient, and the slots of
-a Gaussian are summed in a fixed order.
+Gaussians are sorted by depth once and listed per tile by a stable counting sort. One worker owns a
+tile, so that no two workers write the same pixel: no atomics, and the same bits at every run. It draws
+Gaussian by Gaussian, and blocks of 4 x 4 pixels at a time: the pixels of a block are the lanes of a
+vector (kernels.lanes), and a pixel that the ellipse does not reach, or that is finished, is masked out.
+The backward pass walks the same lists in reverse; each (Gaussian, tile) pair has a private slot for its
+gradient, and the slots of a Gaussian are summed in a fixed order.
 
 Eq. 8's depth is a sum weighted by alpha; divide by alpha for an expected depth.
 """
 
 from dataclasses import dataclass
 
-import numpy as np
 import taichi as ti
 import torch
 from torch import Tensor
 
+from kernels.lanes import LANES, exp, integer_lanes, lanes, largest, vector_instructions, zeros
 from kernels.projection import (
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
-    CULLED,
-    DEPTH,
     EXTENT,
-    GRADIENT_SIZE,
+    FEATURES,
+    GRADIENT_FEATURES,
     HALF_HEIGHT,
+    HALF_WIDTH,
     LOW_PASS,
+    MAX_TILES,
     MEAN_X,
     MEAN_Y,
+    MIN_ALPHA,
+    NOT_DRAWN,
     OPACITY,
-    RECORD_SIZE,
     _project_backward,
     _project_forward,
-    tile_range,
+    unpack_tiles,
 )
 from kernels.runtime import CHUNK, check_shape, float_dtype, plain, workers
 
-TILE = 32  # pixels; 32 and 64 are equally fast on a CPU, 16 is slower
+TILE = 32  # pixels; a multiple of the blocks below
 MAX_ALPHA = 0.99  # so that T never reaches zero and the backward pass can divide by 1 - alpha
 MIN_TRANSMITTANCE = 1e-4  # a pixel is finished below this
 VISIBLE_TRANSMITTANCE = 0.5  # Sec. III-E: visible while the accumulated opacity is below 0.5
+BLOCK_WIDTH, BLOCK_HEIGHT = 4, 4  # pixels handled at once: LANES of them
+T_NOW, SUFFIX, GRAD_DEPTH = 0, 1, 2  # columns of the backward pass's state
+RADIX_BITS = 11  # three digits hold the 31 bits of a positive float
+RADIX = 2**RADIX_BITS
 POSE_PARTS = 1024  # partial sums of the pose gradient, added in float64
 
 
 @ti.func
-def index_of(key):
-    return ti.cast(key, ti.i32)  # keeps the lower 32 bits
+def lane_columns():
+    return ti.Vector([float(lane % BLOCK_WIDTH) for lane in range(LANES)])
+
+
+@ti.func
+def lane_rows():
+    return ti.Vector([float(lane // BLOCK_WIDTH) for lane in range(LANES)])
 
 
 @ti.kernel
-def _count_pairs(
-    keys: ti.types.ndarray(ti.i64, ndim=1),  # [N] sorted
-    num_drawn: ti.i32,
-    record: ti.types.ndarray(ndim=2),
-    width: ti.i32,
-    height: ti.i32,
-    tile: ti.i32,
-    counts: ti.types.ndarray(ti.i32, ndim=2),  # out [workers, tiles]
+def _sort_by_depth(
+    depth_bits: ti.types.ndarray(ti.i32, ndim=1),  # [N]
+    keys: ti.types.ndarray(ti.i32, ndim=2),  # scratch [2, N] depth bits
+    order: ti.types.ndarray(ti.i32, ndim=2),  # [2, N] Gaussians; out: row 1, the drawn ones by depth
+    digits: ti.types.ndarray(ti.i32, ndim=2),  # scratch [3, RADIX]
+    num_drawn: ti.types.ndarray(ti.i32, ndim=1),  # out [1]
 ):
-    num_workers = counts.shape[0]
+    # A stable radix sort in three passes; an unstable one would not be repeatable for equal depths.
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for digit in range(RADIX):
+            for k in ti.static(range(3)):
+                digits[k, digit] = 0
+        n = 0
+        for i in range(depth_bits.shape[0]):
+            key = depth_bits[i]
+            if key != NOT_DRAWN:
+                keys[0, n], order[0, n] = key, i
+                n += 1
+                for k in ti.static(range(3)):
+                    digit = (key >> (RADIX_BITS * k)) % RADIX
+                    digits[k, digit] = digits[k, digit] + 1
+        num_drawn[0] = n
+        for k in ti.static(range(3)):
+            total = 0
+            for digit in range(RADIX):
+                number = digits[k, digit]
+                digits[k, digit] = total
+                total += number
+            source, target = ti.static(k % 2, 1 - k % 2)
+            for i in range(n):
+                key = keys[source, i]
+                digit = (key >> (RADIX_BITS * k)) % RADIX
+                place = digits[k, digit]
+                digits[k, digit] = place + 1
+                keys[target, place], order[target, place] = key, order[source, i]
+
+
+@ti.kernel
+def _list_pairs(
+    # inputs
+    order: ti.types.ndarray(ti.i32, ndim=2),  # [2, N] row 1: drawn Gaussians by depth
+    num_drawn: ti.types.ndarray(ti.i32, ndim=1),  # [1]
+    packed_tiles: ti.types.ndarray(ti.i32, ndim=1),  # [N]
+    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [N + 1]
+    columns: ti.i32,  # of tiles
+    # scratch
+    places: ti.types.ndarray(ti.i32, ndim=2),  # [workers, tiles]
+    # outputs
+    tile_start: ti.types.ndarray(ti.i32, ndim=1),  # [tiles + 1]
+    gaussian: ti.types.ndarray(ti.i32, ndim=1),  # [pairs] Gaussian, by tile and then by depth
+    slot: ti.types.ndarray(ti.i32, ndim=1),  # [pairs] its private gradient row
+):
+    # A stable counting sort: workers take consecutive parts of the order, first to count and then to fill.
+    num_workers, num_tiles = places.shape[0], places.shape[1]
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
-            w = chunk // CHUNK
-            for t in range(counts.shape[1]):
-                counts[w, t] = 0
-            columns = (width + tile - 1) // tile
-            for k in range(num_drawn * w // num_workers, num_drawn * (w + 1) // num_workers):
-                r = tile_range(record, index_of(keys[k]), width, height, tile)
-                for ty in range(r[2], r[3] + 1):
-                    for tx in range(r[0], r[1] + 1):
-                        counts[w, ty * columns + tx] = counts[w, ty * columns + tx] + 1
-
-
-@ti.kernel
-def _prefix_sums(
-    num_tiles: ti.types.ndarray(ti.i32, ndim=1),  # [N] tiles of each Gaussian
-    counts: ti.types.ndarray(ti.i32, ndim=2),  # [workers, tiles]: counts in, first positions out
-    tile_start: ti.types.ndarray(ti.i32, ndim=1),  # out [tiles + 1]
-    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # out [N + 1]
-):
+            w, n = chunk // CHUNK, num_drawn[0]
+            for t in range(num_tiles):
+                places[w, t] = 0
+            for rank in range(n * w // num_workers, n * (w + 1) // num_workers):
+                left, right, top, bottom = unpack_tiles(packed_tiles[order[1, rank]])
+                for ty in range(top, bottom + 1):
+                    for tx in range(left, right + 1):
+                        places[w, ty * columns + tx] = places[w, ty * columns + tx] + 1
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
-        for t in range(counts.shape[1]):
+        for t in range(num_tiles):
             tile_start[t] = total
-            for w in range(counts.shape[0]):
-                count = counts[w, t]
-                counts[w, t] = total
-                total += count
-        tile_start[counts.shape[1]] = total
-        slots = 0
-        for i in range(num_tiles.shape[0]):
-            first_slot[i] = slots
-            slots += num_tiles[i]
-        first_slot[num_tiles.shape[0]] = slots
-
-
-@ti.kernel
-def _fill_lists(
-    keys: ti.types.ndarray(ti.i64, ndim=1),
-    num_drawn: ti.i32,
-    record: ti.types.ndarray(ndim=2),
-    width: ti.i32,
-    height: ti.i32,
-    tile: ti.i32,
-    positions: ti.types.ndarray(ti.i32, ndim=2),  # [workers, tiles] next free place, counted up
-    first_slot: ti.types.ndarray(ti.i32, ndim=1),
-    gaussian: ti.types.ndarray(ti.i32, ndim=1),  # out [pairs] Gaussian, by tile and then by depth
-    slot: ti.types.ndarray(ti.i32, ndim=1),  # out [pairs] its private gradient row
-):
-    num_workers = positions.shape[0]
+            for w in range(num_workers):
+                number = places[w, t]
+                places[w, t] = total
+                total += number
+        tile_start[num_tiles] = total
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
-            w = chunk // CHUNK
-            columns = (width + tile - 1) // tile
-            for k in range(num_drawn * w // num_workers, num_drawn * (w + 1) // num_workers):
-                g = index_of(keys[k])
-                r = tile_range(record, g, width, height, tile)
+            w, n = chunk // CHUNK, num_drawn[0]
+            for rank in range(n * w // num_workers, n * (w + 1) // num_workers):
+                g = order[1, rank]
+                left, right, top, bottom = unpack_tiles(packed_tiles[g])
                 s = first_slot[g]
-                for ty in range(r[2], r[3] + 1):
-                    for tx in range(r[0], r[1] + 1):
-                        place = positions[w, ty * columns + tx]
-                        positions[w, ty * columns + tx] = place + 1
+                for ty in range(top, bottom + 1):
+                    for tx in range(left, right + 1):
+                        place = places[w, ty * columns + tx]
+                        places[w, ty * columns + tx] = place + 1
                         gaussian[place] = g
                         slot[place] = s
                         s += 1
 
 
 @ti.func
-def row_span(first, last, mean_x, mean_y, a, b, c, extent, y):
-    """Columns of row y where d^T K d <= 2 extent: the roots of a dx^2 + 2 b dy dx + c dy^2 = 2 extent."""
-    dy = y - mean_y
-    discriminant = b * dy * b * dy - a * (c * dy * dy - 2.0 * extent)
-    begin, end = 0, -1
-    if discriminant > 0:
-        root = ti.sqrt(discriminant)
-        begin = ti.max(first, ti.cast(ti.ceil(mean_x + (-b * dy - root) / a), ti.i32))
-        end = ti.min(last, ti.cast(ti.floor(mean_x + (-b * dy + root) / a), ti.i32))
-    return begin, end
+def block_range(mean, half_extent, tile_begin, tile_past, size):
+    """Blocks of `size` pixels of the tile, begin and past the end, that an ellipse reaches."""
+    first = ti.max(tile_begin, ti.cast(ti.ceil(mean - half_extent), ti.i32))
+    last = ti.min(tile_past - 1, ti.cast(ti.floor(mean + half_extent), ti.i32))
+    begin, past = 0, 0
+    if first <= last:
+        begin, past = (first - tile_begin) // size, (last - tile_begin) // size + 1
+    return begin, past
 
 
-@ti.func
-def row_exponentials(opacity, a, b, c, dx, dy):
-    """alpha at dx and its ratio to the next pixel's; ratios themselves shrink by exp(-a) a pixel."""
-    alpha = opacity * ti.exp(-(0.5 * c * dy * dy + dx * (0.5 * a * dx + b * dy)))
-    return alpha, ti.exp(-(a * (dx + 0.5) + b * dy))
-
-
+@vector_instructions
 @ti.kernel
 def _rasterize_forward(
     # inputs
-    record: ti.types.ndarray(ndim=2),  # [N, RECORD_SIZE]
-    colors: ti.types.ndarray(ndim=2),  # [N, C]
+    record: ti.types.ndarray(ndim=2),  # [N, FEATURES + 1 + C]
     tile_start: ti.types.ndarray(ti.i32, ndim=1),  # [tiles + 1]
     gaussian: ti.types.ndarray(ti.i32, ndim=1),  # [pairs]
     tile: ti.i32,
-    num_workers: ti.i32,
     next_tile: ti.types.ndarray(ti.i32, ndim=1),  # [1] queue of tiles, starts at 0
+    # scratch
+    sums: lanes(1),  # [workers * blocks * (1 + C)] of the features
+    front: integer_lanes(1),  # [workers * blocks] last Gaussian that was drawn at T > 0.5
     # outputs
     image: ti.types.ndarray(ndim=3),  # [H, W, C]
     depth: ti.types.ndarray(ndim=2),  # [H, W]
-    transmittance: ti.types.ndarray(ndim=2),  # [H, W]
-    last: ti.types.ndarray(ti.i32, ndim=2),  # [H, W] last pair that was drawn
+    alpha_image: ti.types.ndarray(ndim=2),  # [H, W]
+    transmittance: lanes(1),  # [tiles * blocks]
+    last: integer_lanes(1),  # [tiles * blocks] last pair that was drawn
     visible: ti.types.ndarray(ti.u8, ndim=1),  # [N] zeros in, 1 where drawn at T > 0.5
     dominant: ti.types.ndarray(ti.i32, ndim=2),  # [H, W] Gaussian at which T falls below 0.5, -1: none
     C: ti.template(),
 ):
     height, width = depth.shape[0], depth.shape[1]
-    columns = (width + tile - 1) // tile
+    columns, blocks_across, num_blocks = (width + tile - 1) // tile, tile // BLOCK_WIDTH, tile * tile // LANES
+    num_workers = sums.shape[0] // (num_blocks * (1 + C))
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
+            w = chunk // CHUNK
             t = ti.atomic_add(next_tile[0], 1)
             while t < tile_start.shape[0] - 1:
                 x0, y0 = (t % columns) * tile, (t // columns) * tile
-                x1, y1 = ti.min(x0 + tile, width) - 1, ti.min(y0 + tile, height) - 1
-                for y in range(y0, y1 + 1):
-                    for x in range(x0, x1 + 1):
-                        transmittance[y, x] = 1.0
-                        depth[y, x] = 0.0
-                        last[y, x] = -1
-                        dominant[y, x] = -1
-                        for k in ti.static(range(C)):
-                            image[y, x, k] = 0.0
+                x1, y1 = ti.min(x0 + tile, width), ti.min(y0 + tile, height)
+                first, own_first = t * num_blocks, w * num_blocks
+                for block in range(num_blocks):
+                    x = x0 + block % blocks_across * BLOCK_WIDTH + lane_columns()
+                    y = y0 + block // blocks_across * BLOCK_HEIGHT + lane_rows()
+                    # pixels outside the image count as finished: nothing is drawn there
+                    transmittance[first + block] = ti.select((x < width) & (y < height), 1.0, 0.0)
+                    last[first + block] = ti.Vector([-1 for _ in range(LANES)])
+                    for k in ti.static(range(1 + C)):
+                        sums[(own_first + block) * (1 + C) + k] = zeros()
                 for pair in range(tile_start[t], tile_start[t + 1]):
                     g = gaussian[pair]
                     mean_x, mean_y = record[g, MEAN_X], record[g, MEAN_Y]
                     a, b, c = record[g, CONIC_XX], record[g, CONIC_XY], record[g, CONIC_YY]
-                    opacity, d, extent = record[g, OPACITY], record[g, DEPTH], record[g, EXTENT]
-                    half_height = record[g, HALF_HEIGHT]
-                    color = ti.Vector([0.0 for _ in range(C)])
-                    for k in ti.static(range(C)):
-                        color[k] = colors[g, k]
-                    ratio_of_ratios = ti.exp(-a)
-                    seen = 0
-                    top = ti.max(y0, ti.cast(ti.ceil(mean_y - half_height), ti.i32))
-                    bottom = ti.min(y1, ti.cast(ti.floor(mean_y + half_height), ti.i32))
-                    for y in range(top, bottom + 1):
-                        begin, end = row_span(x0, x1, mean_x, mean_y, a, b, c, extent, y)
-                        alpha, ratio = row_exponentials(opacity, a, b, c, begin - mean_x, y - mean_y)
-                        for x in range(begin, end + 1):
-                            T = transmittance[y, x]
-                            weight = ti.min(MAX_ALPHA, alpha) * T
-                            alpha *= ratio
-                            ratio *= ratio_of_ratios
-                            if T > MIN_TRANSMITTANCE:
-                                transmittance[y, x] = T - weight
-                                depth[y, x] = depth[y, x] + weight * d
-                                for k in ti.static(range(C)):
-                                    image[y, x, k] = image[y, x, k] + weight * color[k]
-                                last[y, x] = pair
-                                if T > VISIBLE_TRANSMITTANCE:
-                                    seen = 1
-                                    if T - weight <= VISIBLE_TRANSMITTANCE:
-                                        dominant[y, x] = g
-                    if seen == 1:
+                    extent = record[g, EXTENT]
+                    half_width, half_height = record[g, HALF_WIDTH], record[g, HALF_HEIGHT]
+                    feature = [record[g, FEATURES + k] for k in range(1 + C)]
+                    left, right = block_range(mean_x, half_width, x0, x1, BLOCK_WIDTH)
+                    top, bottom = block_range(mean_y, half_height, y0, y1, BLOCK_HEIGHT)
+                    seen = zeros()
+                    for row in range(top, bottom):
+                        dy = (y0 + row * BLOCK_HEIGHT - mean_y) + lane_rows()
+                        dx = (x0 + left * BLOCK_WIDTH - mean_x) + lane_columns()
+                        for column in range(left, right):
+                            block = first + row * blocks_across + column
+                            # d^T K d <= 2 extent where this is positive, and there o exp(-1/2 d^T K d) is
+                            # exp(inside) / 255
+                            inside = extent - 0.5 * c * dy * dy - dx * (0.5 * a * dx + b * dy)
+                            T = transmittance[block]
+                            is_drawn = (inside >= 0) & (T > MIN_TRANSMITTANCE)
+                            alpha = ti.min(MAX_ALPHA, MIN_ALPHA * exp(inside))
+                            weight = ti.select(is_drawn, alpha * T, 0.0)
+                            transmittance[block] = T - weight
+                            last[block] = ti.select(is_drawn, pair, last[block])
+                            is_front = is_drawn & (T > VISIBLE_TRANSMITTANCE)
+                            seen = ti.select(is_front, 1.0, seen)
+                            own = own_first + row * blocks_across + column
+                            front[own] = ti.select(is_front, g, front[own])
+                            place = own * (1 + C)
+                            for k in ti.static(range(1 + C)):
+                                sums[place + k] = sums[place + k] + weight * feature[k]
+                            dx += BLOCK_WIDTH
+                    if largest(seen) > 0:
                         visible[g] = ti.cast(1, ti.u8)
+                for block in range(num_blocks):
+                    column, row = block % blocks_across, block // blocks_across
+                    for lane in ti.static(range(LANES)):
+                        x = x0 + column * BLOCK_WIDTH + lane % BLOCK_WIDTH
+                        y = y0 + row * BLOCK_HEIGHT + lane // BLOCK_WIDTH
+                        if x < width and y < height:
+                            depth[y, x] = sums[(own_first + block) * (1 + C)][lane]
+                            T_end = transmittance[first + block][lane]
+                            dominant[y, x] = -1
+                            if T_end <= VISIBLE_TRANSMITTANCE:
+                                dominant[y, x] = front[own_first + block][lane]
+                            alpha_image[y, x] = 1.0 - T_end
+                            for k in ti.static(range(C)):
+                                image[y, x, k] = sums[(own_first + block) * (1 + C) + 1 + k][lane]
                 t = ti.atomic_add(next_tile[0], 1)
 
 
+@vector_instructions
 @ti.kernel
 def _rasterize_backward(
     # inputs
-    record: ti.types.ndarray(ndim=2),  # [N, RECORD_SIZE]
-    colors: ti.types.ndarray(ndim=2),  # [N, C]
+    record: ti.types.ndarray(ndim=2),  # [N, FEATURES + 1 + C]
     tile_start: ti.types.ndarray(ti.i32, ndim=1),  # [tiles + 1]
     gaussian: ti.types.ndarray(ti.i32, ndim=1),  # [pairs]
     slot: ti.types.ndarray(ti.i32, ndim=1),  # [pairs]
     tile: ti.i32,
-    num_workers: ti.i32,
     next_tile: ti.types.ndarray(ti.i32, ndim=1),  # [1] queue of tiles, starts at 0
-    transmittance: ti.types.ndarray(ndim=2),  # [H, W] final T of the forward pass
-    last: ti.types.ndarray(ti.i32, ndim=2),  # [H, W]
+    transmittance: lanes(1),  # [tiles * blocks] final T of the forward pass
+    last: integer_lanes(1),  # [tiles * blocks]
     grad_image: ti.types.ndarray(ndim=3),  # [H, W, C]
     grad_depth: ti.types.ndarray(ndim=2),  # [H, W]
     grad_alpha: ti.types.ndarray(ndim=2),  # [H, W]
     # scratch
-    T_now: ti.types.ndarray(ndim=2),  # [H, W]
-    suffix: ti.types.ndarray(ndim=2),  # [H, W]
+    state: lanes(1),  # [workers * blocks * (2 + 1 + C)] T, S, and gradients of the features
     # outputs
-    slot_grad: ti.types.ndarray(ndim=2),  # [pairs, GRADIENT_SIZE + C]
+    slot_grad: ti.types.ndarray(ndim=2),  # [pairs, GRADIENT_FEATURES + 1 + C]
     C: ti.template(),
 ):
-    # With q_i = c_i . dI + d_i dD, the loss depends on alpha_i as
+    # With q_i = f_i . dF for the features f = (depth, colours), the loss depends on alpha_i as
     #   dL/dalpha_i = T_i q_i - S_i / (1 - alpha_i),   S_i = sum_{j>i} alpha_j T_j q_j - T_end dA,
     # because alpha_i scales its own weight and every later weight (and T_end) holds a factor 1 - alpha_i.
     # T_i is recovered backwards from T_end by dividing by 1 - alpha_i. With v = alpha dL/dalpha:
     #   d mean = K sum v d,   dK_xx = -1/2 sum v dx^2,   dK_xy = -sum v dx dy,   d opacity = sum v / o.
-    height, width = T_now.shape[0], T_now.shape[1]
-    columns = (width + tile - 1) // tile
+    height, width = grad_depth.shape[0], grad_depth.shape[1]
+    columns, blocks_across, num_blocks = (width + tile - 1) // tile, tile // BLOCK_WIDTH, tile * tile // LANES
+    num_workers = state.shape[0] // (num_blocks * (GRAD_DEPTH + 1 + C))
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
+            w = chunk // CHUNK
             t = ti.atomic_add(next_tile[0], 1)
             while t < tile_start.shape[0] - 1:
                 x0, y0 = (t % columns) * tile, (t // columns) * tile
-                x1, y1 = ti.min(x0 + tile, width) - 1, ti.min(y0 + tile, height) - 1
-                for y in range(y0, y1 + 1):
-                    for x in range(x0, x1 + 1):
-                        T_now[y, x] = transmittance[y, x]
-                        suffix[y, x] = -transmittance[y, x] * grad_alpha[y, x]
+                x1, y1 = ti.min(x0 + tile, width), ti.min(y0 + tile, height)
+                first_block, scratch = t * num_blocks, w * num_blocks * (GRAD_DEPTH + 1 + C)
+                for block in range(num_blocks):
+                    place = scratch + block * (GRAD_DEPTH + 1 + C)
+                    T_end = transmittance[first_block + block]
+                    state[place + T_NOW] = T_end
+                    column, row = block % blocks_across, block // blocks_across
+                    for lane in ti.static(range(LANES)):  # outside the image any pixel will do
+                        x = ti.min(x0 + column * BLOCK_WIDTH + lane % BLOCK_WIDTH, width - 1)
+                        y = ti.min(y0 + row * BLOCK_HEIGHT + lane // BLOCK_WIDTH, height - 1)
+                        state[place + SUFFIX][lane] = -T_end[lane] * grad_alpha[y, x]
+                        state[place + GRAD_DEPTH][lane] = grad_depth[y, x]
+                        for k in ti.static(range(C)):
+                            state[place + GRAD_DEPTH + 1 + k][lane] = grad_image[y, x, k]
                 first, past = tile_start[t], tile_start[t + 1]
-                for k in range(past - first):
-                    pair = past - 1 - k
+                for from_end in range(past - first):
+                    pair = past - 1 - from_end
                     g = gaussian[pair]
                     mean_x, mean_y = record[g, MEAN_X], record[g, MEAN_Y]
                     a, b, c = record[g, CONIC_XX], record[g, CONIC_XY], record[g, CONIC_YY]
-                    opacity, d, extent = record[g, OPACITY], record[g, DEPTH], record[g, EXTENT]
-                    half_height = record[g, HALF_HEIGHT]
-                    color = ti.Vector([0.0 for _ in range(C)])
-                    dcolor = ti.Vector([0.0 for _ in range(C)])
-                    for m in ti.static(range(C)):
-                        color[m] = colors[g, m]
-                    ratio_of_ratios = ti.exp(-a)
-                    # moments of v over the pixels, and the gradient of the depth
-                    v_sum, v_x, v_y, v_xx, v_xy, v_yy, ddepth = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                    top = ti.max(y0, ti.cast(ti.ceil(mean_y - half_height), ti.i32))
-                    bottom = ti.min(y1, ti.cast(ti.floor(mean_y + half_height), ti.i32))
-                    for y in range(top, bottom + 1):
-                        begin, end = row_span(x0, x1, mean_x, mean_y, a, b, c, extent, y)
-                        dy = y - mean_y
-                        alpha_raw, ratio = row_exponentials(opacity, a, b, c, begin - mean_x, dy)
-                        row, row_x, row_xx = 0.0, 0.0, 0.0
-                        for x in range(begin, end + 1):
-                            alpha = ti.min(MAX_ALPHA, alpha_raw)
-                            clamped = alpha_raw > MAX_ALPHA
-                            alpha_raw *= ratio
-                            ratio *= ratio_of_ratios
-                            if pair <= last[y, x]:
-                                dx = x - mean_x
-                                inverse = 1.0 / (1.0 - alpha)
-                                T = T_now[y, x] * inverse
-                                T_now[y, x] = T
-                                weight = alpha * T
-                                q = d * grad_depth[y, x]
-                                ddepth += weight * grad_depth[y, x]
-                                for m in ti.static(range(C)):
-                                    q += color[m] * grad_image[y, x, m]
-                                    dcolor[m] += weight * grad_image[y, x, m]
-                                S = suffix[y, x]
-                                suffix[y, x] = S + weight * q
-                                if not clamped:  # min() passes no gradient where it cuts
-                                    v = alpha * (T * q - S * inverse)
-                                    row += v
-                                    row_x += v * dx
-                                    row_xx += v * dx * dx
-                        v_sum += row
-                        v_x += row_x
-                        v_xx += row_xx
-                        v_y += row * dy
-                        v_xy += row_x * dy
-                        v_yy += row * dy * dy
+                    opacity, extent = record[g, OPACITY], record[g, EXTENT]
+                    half_width, half_height = record[g, HALF_WIDTH], record[g, HALF_HEIGHT]
+                    feature = [record[g, FEATURES + k] for k in range(1 + C)]
+                    left, right = block_range(mean_x, half_width, x0, x1, BLOCK_WIDTH)
+                    top, bottom = block_range(mean_y, half_height, y0, y1, BLOCK_HEIGHT)
+                    # moments of v over the pixels, and the gradients of the features
+                    v_sum, v_x, v_y, v_xx, v_xy, v_yy = zeros(), zeros(), zeros(), zeros(), zeros(), zeros()
+                    dfeature = [zeros() for _ in range(1 + C)]
+                    for row in range(top, bottom):
+                        dy = (y0 + row * BLOCK_HEIGHT - mean_y) + lane_rows()
+                        dx = (x0 + left * BLOCK_WIDTH - mean_x) + lane_columns()
+                        for column in range(left, right):
+                            block = row * blocks_across + column
+                            place = scratch + block * (GRAD_DEPTH + 1 + C)
+                            inside = extent - 0.5 * c * dy * dy - dx * (0.5 * a * dx + b * dy)
+                            is_drawn = (inside >= 0) & (last[first_block + block] >= pair)
+                            raw = MIN_ALPHA * exp(inside)
+                            alpha = ti.select(is_drawn, ti.min(MAX_ALPHA, raw), 0.0)
+                            inverse = 1.0 / (1.0 - alpha)
+                            T = state[place + T_NOW] * inverse
+                            state[place + T_NOW] = T
+                            weight = alpha * T
+                            q = zeros()
+                            for k in ti.static(range(1 + C)):
+                                q += feature[k] * state[place + GRAD_DEPTH + k]
+                                dfeature[k] += weight * state[place + GRAD_DEPTH + k]
+                            S = state[place + SUFFIX]
+                            state[place + SUFFIX] = S + weight * q
+                            # min() passes no gradient where it cuts
+                            v = ti.select(raw <= MAX_ALPHA, alpha * (T * q - S * inverse), 0.0)
+                            v_sum += v
+                            v_x += v * dx
+                            v_y += v * dy
+                            v_xx += v * dx * dx
+                            v_xy += v * dx * dy
+                            v_yy += v * dy * dy
+                            dx += BLOCK_WIDTH
+                    moment_x, moment_y = v_x.sum(), v_y.sum()
                     s = slot[pair]
-                    slot_grad[s, MEAN_X] = a * v_x + b * v_y
-                    slot_grad[s, MEAN_Y] = b * v_x + c * v_y
-                    slot_grad[s, CONIC_XX] = -0.5 * v_xx
-                    slot_grad[s, CONIC_XY] = -v_xy
-                    slot_grad[s, CONIC_YY] = -0.5 * v_yy
-                    slot_grad[s, OPACITY] = v_sum / opacity
-                    slot_grad[s, DEPTH] = ddepth
-                    for m in ti.static(range(C)):
-                        slot_grad[s, GRADIENT_SIZE + m] = dcolor[m]
+                    slot_grad[s, MEAN_X] = a * moment_x + b * moment_y
+                    slot_grad[s, MEAN_Y] = b * moment_x + c * moment_y
+                    slot_grad[s, CONIC_XX] = -0.5 * v_xx.sum()
+                    slot_grad[s, CONIC_XY] = -v_xy.sum()
+                    slot_grad[s, CONIC_YY] = -0.5 * v_yy.sum()
+                    slot_grad[s, OPACITY] = v_sum.sum() / opacity
+                    for k in ti.static(range(1 + C)):
+                        slot_grad[s, GRADIENT_FEATURES + k] = dfeature[k].sum()
                 t = ti.atomic_add(next_tile[0], 1)
 
 
@@ -358,69 +396,63 @@ class _Rasterize(torch.autograd.Function):
         def integers(*shape: int) -> Tensor:
             return torch.empty(shape, dtype=torch.int32, device=device)
 
-        record, num_tiles = floats(n, RECORD_SIZE), integers(n)
-        keys = torch.empty(n, dtype=torch.int64, device=device)
+        record, depth_bits, packed_tiles = floats(n, FEATURES + 1 + channels), integers(n), integers(n)
+        first_slot = integers(n + 1)
         _project_forward(
-            means_, quats_, scales_, opacities_, pose_, *intrinsics, width, height, tile,
-            low_pass, record, keys, num_tiles,
+            means_, quats_, scales_, opacities_, colors_, pose_, *intrinsics, width, height, tile, low_pass,
+            record, depth_bits, packed_tiles, first_slot,
         )  # fmt: skip
-        keys, num_drawn = _sorted_by_depth(keys)
-        tiles = -(-width // tile) * -(-height // tile)
-        counts, tile_start, first_slot = integers(workers(), tiles), integers(tiles + 1), integers(n + 1)
-        _count_pairs(keys, num_drawn, record, width, height, tile, counts)
-        _prefix_sums(num_tiles, counts, tile_start, first_slot)
-        pairs = int(tile_start[-1])
-        gaussian, slot = integers(max(pairs, 1)), integers(max(pairs, 1))
-        _fill_lists(keys, num_drawn, record, width, height, tile, counts, first_slot, gaussian, slot)
-
-        image, depth = floats(height, width, channels), floats(height, width)
-        transmittance, last = floats(height, width), integers(height, width)
+        order, num_drawn = integers(2, n), integers(1)
+        _sort_by_depth(depth_bits, integers(2, n), order, integers(3, RADIX), num_drawn)
+        columns, rows = -(-width // tile), -(-height // tile)
+        tiles, blocks, pairs = columns * rows, tile * tile // LANES, max(int(first_slot[-1]), 1)
+        tile_start, gaussian, slot = integers(tiles + 1), integers(pairs), integers(pairs)
+        _list_pairs(
+            order, num_drawn, packed_tiles, first_slot, columns, integers(workers(), tiles),
+            tile_start, gaussian, slot,
+        )  # fmt: skip
+        image, depth, alpha = floats(height, width, channels), floats(height, width), floats(height, width)
+        transmittance, last = floats(tiles * blocks, LANES), integers(tiles * blocks, LANES)
+        sums = floats(workers() * blocks * (1 + channels), LANES)
+        front, dominant = integers(workers() * blocks, LANES), integers(height, width)
         visible = torch.zeros(n, dtype=torch.uint8, device=device)
-        dominant = integers(height, width)
         queue = torch.zeros(1, dtype=torch.int32, device=device)
         _rasterize_forward(
-            record, colors_, tile_start, gaussian, tile, workers(), queue,
-            image, depth, transmittance, last, visible, dominant, channels,
+            record, tile_start, gaussian, tile, queue, sums, front,
+            image, depth, alpha, transmittance, last, visible, dominant, channels,
         )  # fmt: skip
         ctx.save_for_backward(*inputs, record, tile_start, first_slot, gaussian, slot, transmittance, last)
         ctx.intrinsics, ctx.tile = intrinsics, tile
         visible = visible.bool()
         ctx.mark_non_differentiable(visible, dominant)
-        return image, depth, 1 - transmittance, visible, dominant
+        return image, depth, alpha, visible, dominant
 
     @staticmethod
     def backward(ctx, grad_image, grad_depth, grad_alpha, _visible, _dominant):
         (
-            means, quats, scales, _, colors, pose,
+            means, quats, scales, opacities, colors, pose,
             record, tile_start, first_slot, gaussian, slot, transmittance, last,
         ) = ctx.saved_tensors  # fmt: skip
         channels = colors.shape[1]
-        slot_grad = record.new_empty(len(slot), GRADIENT_SIZE + channels)
+        slot_grad = record.new_empty(len(slot), GRADIENT_FEATURES + 1 + channels)
         queue = torch.zeros(1, dtype=torch.int32, device=record.device)
+        blocks = ctx.tile**2 // LANES
+        state = record.new_empty(workers() * blocks * (GRAD_DEPTH + 1 + channels), LANES)
         _rasterize_backward(
-            record, colors, tile_start, gaussian, slot, ctx.tile, workers(), queue, transmittance, last,
+            record, tile_start, gaussian, slot, ctx.tile, queue, transmittance, last,
             grad_image.contiguous(), grad_depth.contiguous(), grad_alpha.contiguous(),
-            torch.empty_like(transmittance), torch.empty_like(transmittance), slot_grad, channels,
+            state, slot_grad, channels,
         )  # fmt: skip
-        grads = [torch.empty_like(x) for x in (means, quats, scales)]
-        grad_opacities, grad_colors = record.new_empty(len(means)), torch.empty_like(colors)
+        grads = [torch.empty_like(x) for x in (means, quats, scales, opacities, colors)]
         pose_parts = record.new_empty(POSE_PARTS, 12)
         fx, fy, _, _ = ctx.intrinsics
         _project_backward(
             means, quats, scales, pose, fx, fy, record, first_slot, slot_grad,
-            *grads, grad_opacities, grad_colors, pose_parts, channels,
+            *grads, pose_parts, channels,
         )  # fmt: skip
         grad_pose = torch.zeros_like(pose)
         grad_pose[:3] = pose_parts.sum(0, dtype=torch.float64).view(3, 4).to(pose.dtype)
-        return *grads, grad_opacities, grad_colors, grad_pose, None, None, None, None
-
-
-def _sorted_by_depth(keys: Tensor) -> tuple[Tensor, int]:
-    """Return the keys in ascending order and how many of them are drawn."""
-    # numpy's int64 sort is vectorised; torch's CPU sort is 10 to 20 times slower.
-    ordered = keys.sort().values if keys.is_cuda else torch.from_numpy(np.sort(keys.numpy()))
-    first_culled = torch.tensor(CULLED << 32, dtype=torch.int64, device=keys.device)
-    return ordered, int(torch.searchsorted(ordered, first_culled))
+        return *grads, grad_pose, None, None, None, None
 
 
 def rasterize(
@@ -450,6 +482,10 @@ def rasterize(
         ("T_camera_world", T_camera_world, (4, 4)),
     ):
         check_shape(name, tensor, shape)
+    if tile % BLOCK_WIDTH or tile % BLOCK_HEIGHT or max(size) > MAX_TILES * tile:
+        raise ValueError(
+            f"tile: expected a multiple of {BLOCK_WIDTH} of at least {max(size) / MAX_TILES:.0f}, got {tile}"
+        )
     outputs = _Rasterize.apply(
         means,
         quats,

@@ -95,10 +95,9 @@ def test_a_gaussian_peaks_at_the_pixel_it_was_seeded_from() -> None:
 
 def test_a_nearer_opaque_gaussian_hides_a_farther_one() -> None:
     means = torch.tensor([[0.0, 0, 3.0], [0.0, 0, 1.5]])
-    arguments = (torch.tensor([[1.0, 0, 0, 0]] * 2), torch.tensor([[0.02] * 3, [0.2] * 3]),
-                 torch.tensor([0.99, 0.99]),
-                 torch.tensor([[1.0], [0.0]]), torch.eye(4), INTRINSICS, SIZE)  # fmt: skip
-    view = rasterize(means, *arguments)
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]] * 2), torch.tensor([[0.02] * 3, [0.2] * 3])
+    opacities, colors = torch.tensor([0.99, 0.99]), torch.tensor([[1.0], [0.0]])
+    view = rasterize(means, quats, scales, opacities, colors, torch.eye(4), INTRINSICS, SIZE)
     assert float(view.image[15, 19, 0]) < 0.02
     assert view.visible.tolist() == [False, True]
 
@@ -116,12 +115,31 @@ def test_repeated_runs_and_tile_sizes_agree() -> None:
 
 
 def test_number_of_threads_does_not_change_the_result() -> None:
-    inputs = make_scene(300, seed=6)
-    two = rasterize(*inputs, INTRINSICS, SIZE)
+    inputs = [x.requires_grad_() for x in make_scene(300, seed=6)]
+
+    def image_and_gradients() -> list[torch.Tensor]:
+        view = rasterize(*inputs, INTRINSICS, SIZE)
+        return [view.image, *torch.autograd.grad(view.image.sin().sum() + view.depth.sum(), inputs)]
+
+    two = image_and_gradients()
     kernels.init("cpu", threads=1)
-    one = rasterize(*inputs, INTRINSICS, SIZE)
+    one = image_and_gradients()
     kernels.init("cpu", threads=2)
-    assert torch.equal(one.image, two.image)
+    assert all(torch.equal(a, b) for a, b in zip(one, two))
+
+
+def test_gaussians_of_equal_depth_are_drawn_in_their_order() -> None:
+    means = torch.tensor([[0.0, 0, 2.0]] * 3)
+    colors = torch.tensor([[0.2], [0.9], [0.5]])
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]] * 3), torch.full((3, 3), 0.2)
+    opacities = torch.full((3,), 0.5)
+    view = rasterize(means, quats, scales, opacities, colors, torch.eye(4), (40, 40, 20, 15), SIZE)
+    assert float(view.image[15, 20, 0]) == pytest.approx(0.5 * 0.2 + 0.25 * 0.9 + 0.125 * 0.5, abs=1e-6)
+
+
+def test_a_tile_that_cannot_be_cut_into_blocks_is_refused() -> None:
+    with pytest.raises(ValueError, match="tile: expected a multiple of 4"):
+        rasterize(*make_scene(4, seed=8), INTRINSICS, SIZE, tile=18)
 
 
 def test_an_empty_view_is_black_and_has_zero_gradients() -> None:
