@@ -39,7 +39,7 @@ def parse_config(
     description: str | None = None,
 ) -> Config:
     """Return the settings that the command line asks for; `configs` is the folder of <dataset>.yaml files."""
-    arguments = sys.argv[1:] if argv is None else list(argv)
+    arguments = _with_true(sys.argv[1:] if argv is None else list(argv))
     defaults = Config().model_dump()
 
     def parsed_over(values: dict[str, Any], source: str) -> dict[str, Any]:
@@ -247,12 +247,24 @@ def _describe_unknown(word: str, known: list[str]) -> str:
     return f"unknown option '{option}'" + (f"; did you mean '{close[0]}'?" if close else "")
 
 
-def _options(model: type[BaseModel], prefix: str = "--") -> list[str]:
-    """Return the flags of a settings model."""
+def _with_true(arguments: list[str]) -> list[str]:
+    """Return the arguments with `true` behind every bare switch: `--visualize` is `--visualize true`."""
+    switches = _options(Config, of_type=bool)
+    result = []
+    for word, following in zip(arguments, [*arguments[1:], "--"]):
+        result += [word, "true"] if word in switches and following.startswith("--") else [word]
+    return result
+
+
+def _options(model: type[BaseModel], prefix: str = "--", of_type: type | None = None) -> list[str]:
+    """Return the flags of a settings model, all or those of one type."""
     result = []
     for name, field in model.model_fields.items():
         flag = prefix + name.replace("_", "-")
         kind: Any = field.annotation
         nested = isinstance(kind, type) and issubclass(kind, BaseModel)
-        result += _options(kind, flag + ".") if nested else [flag]
+        if nested:
+            result += _options(kind, flag + ".", of_type)
+        elif of_type is None or kind is of_type:
+            result.append(flag)
     return result

@@ -24,7 +24,7 @@ from edslam_ti import __version__
 from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
-from edslam_ti.errors import DataError
+from edslam_ti.errors import DataError, EdSlamError
 from edslam_ti.evaluation import evaluate_images, fit_event_nerf, psnr, trajectory_errors
 from edslam_ti.export import fuse_mesh, write_gaussian_ply, write_mesh, write_points
 from edslam_ti.frame import FrameBuilder
@@ -68,7 +68,10 @@ def run(config: Config, console: Console | None = None) -> Path:
     Ctrl-C ends the loop early; what there is, is saved, then KeyboardInterrupt is raised.
     """
     console = console or Console()
-    kernels.init(config.device, threads=config.threads)
+    try:
+        kernels.init(config.device, threads=config.threads)
+    except RuntimeError as error:  # no such device
+        raise EdSlamError(str(error)) from error
     viewer = Viewer() if config.visualize else StubViewer()
     state = _prepare(config)
     camera, (first, last) = state.sequence.camera, state.samples.timestamps[[0, -1]]

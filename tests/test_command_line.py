@@ -224,3 +224,10 @@ def test_evaluate_prints_the_errors_of_two_files(tmp_path: Path) -> None:
     assert result.stdout.count("rmse\t0.000000") == 4
     missing = _run(str(ROOT / "apps" / "evaluate.py"), "none.txt", str(tmp_path / "a.txt"))
     assert (missing.returncode, missing.stderr) == (1, "error: none.txt not found\n")
+
+
+def test_a_bare_switch_is_true() -> None:
+    assert parse_config(["--visualize"]).visualize
+    config = parse_config(["--visualize", "--mapping.enabled", "false", "--scene", "room0"])
+    assert config.visualize
+    assert not config.mapping.enabled
