@@ -8,29 +8,37 @@ import taichi as ti
 
 from kernels.runtime import CHUNK, check_shape, workers
 
+MANY_EVENTS = 300_000  # below this numpy is done before a second core has woken up
+
 
 @ti.kernel
-def _update_last_timestamps(
+def _newest_timestamps(
     x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     t: ti.types.ndarray(ti.f64, ndim=1),  # [N] seconds, sorted
-    last: ti.types.ndarray(ti.f64, ndim=2),  # in/out [H, W] seconds
+    height: ti.i32,
+    width: ti.i32,
+    newest: ti.types.ndarray(ti.f64, ndim=1),  # out [workers * H * W] seconds, -inf in
+    num_outside: ti.types.ndarray(ti.i64, ndim=1),  # out [workers] events outside the image
 ):
-    # Serial: parallel plain stores race, and atomics are twice as slow as one core.
-    ti.loop_config(serialize=True)
-    for i in range(x.shape[0]):
-        last[y[i], x[i]] = t[i]
-
-
-@ti.kernel
-def _time_surface(
-    last: ti.types.ndarray(ti.f64, ndim=2),  # [H, W] seconds, -inf where no event came
-    t: ti.f64,
-    decay: ti.f64,
-    surface: ti.types.ndarray(ti.f32, ndim=2),  # out [H, W]
-):
-    for i, j in ti.ndrange(last.shape[0], last.shape[1]):
-        surface[i, j] = ti.cast(ti.exp(ti.cast((last[i, j] - t) / decay, ti.f32)), ti.f32)
+    # Parallel stores to one image race and atomics are slow: each worker has a part of the time and an
+    # image of its own.
+    num_workers = num_outside.shape[0]
+    n = ti.cast(x.shape[0], ti.i64)
+    for chunk in range(num_workers * CHUNK):
+        if chunk % CHUNK == 0:
+            w = chunk // CHUNK
+            first = w * height * width
+            outside = ti.cast(0, ti.i64)
+            for i in range(
+                ti.cast(n * w // num_workers, ti.i32), ti.cast(n * (w + 1) // num_workers, ti.i32)
+            ):
+                row, column = ti.cast(y[i], ti.i32), ti.cast(x[i], ti.i32)
+                if 0 <= row < height and 0 <= column < width:
+                    newest[first + row * width + column] = t[i]
+                else:
+                    outside += 1
+            num_outside[w] = outside
 
 
 @ti.kernel
@@ -62,8 +70,16 @@ def update_last_timestamps(
     check_shape("y", y, x.shape)
     check_shape("t", t, x.shape)
     if len(x):
-        _check_inside(x, y, last.shape)
-        _update_last_timestamps(x, y, t, last)
+        if len(x) < MANY_EVENTS:
+            _check_inside(x, y, last.shape)
+            last[y, x] = t  # of several events at a pixel numpy keeps the last
+        else:
+            newest = np.full(workers() * last.size, -np.inf)
+            num_outside = np.zeros(workers(), np.int64)
+            _newest_timestamps(x, y, t, *last.shape, newest, num_outside)
+            if num_outside.any():
+                _check_inside(x, y, last.shape)
+            np.maximum(last, newest.reshape(-1, *last.shape).max(0), out=last)
 
 
 def time_surface(
@@ -74,9 +90,8 @@ def time_surface(
     """Return the time surface of Eq. 1."""
     if decay <= 0:
         raise ValueError(f"decay: expected a positive time in seconds, got {decay}")
-    surface = np.empty(last.shape, np.float32)
-    _time_surface(last, t, decay, surface)
-    return surface
+    # numpy's exp is vectorised, Taichi's is not.
+    return np.exp(((last - t) / decay).astype(np.float32))
 
 
 def accumulate_polarity(

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from kernels import reference
-from kernels.time_surface import accumulate_polarity, time_surface, update_last_timestamps
+from kernels.time_surface import MANY_EVENTS, accumulate_polarity, time_surface, update_last_timestamps
 
 SHAPE = (12, 16)
 
@@ -61,3 +61,19 @@ def test_events_outside_the_image_are_refused() -> None:
     last = np.full(SHAPE, -np.inf)
     with pytest.raises(ValueError, match="0 <= x < 16"):
         update_last_timestamps(np.array([16], np.int16), np.array([0], np.int16), np.array([0.0]), last)
+
+
+def test_large_batches_match_the_twin_and_events_outside_change_nothing() -> None:
+    rng = np.random.default_rng(3)
+    n, shape = MANY_EVENTS + 1, (30, 40)
+    x, y = rng.integers(0, 40, n).astype(np.int16), rng.integers(0, 30, n).astype(np.int16)
+    t = np.sort(rng.uniform(0, 1, n))
+    last = np.full(shape, -np.inf)
+    update_last_timestamps(x, y, t, last)
+    expected = reference.last_timestamps(*(torch.from_numpy(a) for a in (x, y, t)), shape)
+    assert np.array_equal(last, expected.numpy())
+    before = last.copy()
+    y[-1] = 30
+    with pytest.raises(ValueError, match="0 <= y < 30"):
+        update_last_timestamps(x, y, t + 1, last)
+    assert np.array_equal(last, before)
