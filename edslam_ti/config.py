@@ -85,7 +85,7 @@ class MappingConfig(Stage):
     final_iterations: int = Field(800, ge=0)
     """Steps over all keyframes after the last frame."""
     reduced_share: float = Field(0.5, ge=0, le=1)
-    """Share of the steps that work on images of half the size, at a third of the cost."""
+    """Share of the steps that work on images of half the size, at about two thirds of the cost."""
     pixel_stride: int = Field(2, ge=1)
     """One new Gaussian for every stride x stride pixels that need one."""
     min_visibility: float = Field(0.8, gt=0, lt=1)

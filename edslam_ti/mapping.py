@@ -268,7 +268,7 @@ class GaussianMapper:
         self.gaussians.set_colors(torch.from_numpy(brightness.astype(np.float32))[:, None])
 
     def _reduction(self) -> int:
-        """Draw the size of the next step's images: reduced ones cost a third and settle large surfaces."""
+        """Draw the size of the next step's images: reduced ones cost two thirds of full ones."""
         return REDUCTION if self._random.random() < self._config.reduced_share else 1
 
     def _optimise(
