@@ -7,7 +7,7 @@ results/<dataset>/<scene>/<method>/<time>/ (--out DIR replaces results), and `la
     python apps/slam.py --data-dir data --scene my_room              data/my_room, EventReplica's layout
     python apps/slam.py --dataset rpg --data-dir data --scene slider_depth
     python apps/slam.py --scene room0 --start 1 --duration 2 --mapping.enabled false
-    python apps/slam.py --config results/latest/config.yaml --seed 1      the same run with another seed
+    python apps/slam.py --config results/builtin/office0/ed_slam/latest/config.yaml --seed 1     another seed
 """
 
 from collections.abc import Sequence

@@ -25,7 +25,7 @@ from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation import evaluate_images, fit_event_nerf, psnr, trajectory_errors
+from edslam_ti.evaluation import depth_l1_cm, evaluate_images, fit_event_nerf, psnr, trajectory_errors
 from edslam_ti.export import fuse_mesh, write_gaussian_ply, write_mesh, write_points
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping import GaussianMapper, Mapper
@@ -248,10 +248,11 @@ def _point_latest_to(folder: Path) -> None:
 
 def _true_trajectory(state: Run) -> Trajectory | None:
     """Return the truth at the tracked times, where it is known."""
-    times = [t for t in state.slam.trajectory.timestamps if state.sequence.true_pose(t) is not None]
-    if state.sequence.truth is None or not times:
+    truth = state.sequence.truth
+    if truth is None:
         return None
-    return state.sequence.truth.resampled(np.array(times))
+    times = [t for t in state.slam.trajectory.timestamps if truth.covers(t)]
+    return truth.resampled(np.array(times)) if times else None
 
 
 def _errors(state: Run) -> dict[str, float | None]:
@@ -325,13 +326,10 @@ def _image_metrics(state: Run, folder: Path) -> dict[str, Any]:
             if hasattr(measured, name):
                 metrics[name] = _rounded(getattr(measured, name))
         captions = _captions(renders, truths, masks)
-    errors = [
-        np.abs(v.depth - s.depth)[(s.depth > 0) & (v.depth > 0)]
-        for v, s in zip(views, samples)
-        if s.depth is not None
-    ]
-    if errors and sum(map(len, errors)):
-        metrics["depth_l1_cm"] = _rounded(100 * float(np.concatenate(errors).mean()))
+    pairs = [(v.depth, s.depth) for v, s in zip(views, samples) if s.depth is not None]
+    drawn = [np.where(rendered > 0, true, 0) for rendered, true in pairs]  # only where something is drawn
+    if pairs:
+        metrics["depth_l1_cm"] = _rounded(depth_l1_cm([rendered for rendered, _ in pairs], drawn))
     metrics["num_held_out_views"] = len(views)
     write_render_triptychs(
         folder / "renders",

@@ -9,7 +9,7 @@ import torch
 
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame
-from edslam_ti.geometry import orthonormalized, se3_exp
+from edslam_ti.geometry import orthonormalized, se3_exp, skew
 from edslam_ti.trajectory import Trajectory
 from kernels.patch_warp import NormalEquations, Patches, ResidualModel, extract_patches, normal_equations
 
@@ -104,7 +104,7 @@ class BidirectionalPatchTracker:
     def _track(
         self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory
     ) -> tuple[TrackingResult, float]:
-        last = trajectory.poses[-1]
+        last = trajectory.pose(-1)
         best: tuple[TrackingResult, float] | None = None
         for guess in (predicted, last):  # constant velocity, then a sudden stop
             alignment = self._align(current, guess, trajectory)
@@ -239,10 +239,9 @@ class BidirectionalPatchTracker:
 def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]
     """Return Ad(T) for twists (translation, rotation): T exp(xi) = exp(Ad(T) xi) T."""
     R, t = T[:3, :3], T[:3, 3]
-    t_cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = t_cross @ R
+    result[:3, 3:] = skew(torch.from_numpy(t)).numpy() @ R
     return result
 
 

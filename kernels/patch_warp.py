@@ -181,7 +181,6 @@ def _normal_equations(
                         weight, cost = huber(r, huber_threshold)
                         total[COST] += cost
                         total[NUM_SURFACE] += 1
-                        k = 0
                         for a in ti.static(range(6)):
                             total[21 + a] += weight * J[a] * r
                             for b in ti.static(range(a, 6)):

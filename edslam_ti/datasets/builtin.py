@@ -1,22 +1,12 @@
 """The built-in sequences: simulated once, kept in the user's cache folder."""
 
 import hashlib
-import os
 from pathlib import Path
 
+from edslam_ti.datasets.files import cache_folder
 from edslam_ti.simulation import HandHeldPath, SimulationConfig, make_room, simulate
 
 GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
-CACHE_VARIABLE = "EDSLAM_CACHE"  # environment variable that overrides the cache folder
-
-
-def cache_folder() -> Path:
-    """Return where generated sequences are kept."""
-    if os.environ.get(CACHE_VARIABLE):
-        return Path(os.environ[CACHE_VARIABLE])
-    import platformdirs
-
-    return Path(platformdirs.user_cache_dir("edslam_ti"))
 
 
 def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) -> Path:

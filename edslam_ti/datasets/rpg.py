@@ -17,7 +17,6 @@ Events and images are undistorted here; an event goes to the nearest pixel, or i
 """
 
 import hashlib
-import os
 import sys
 import warnings
 from pathlib import Path
@@ -25,13 +24,19 @@ from typing import BinaryIO
 
 import cv2
 import numpy as np
-import platformdirs
 
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.datasets.event_replica import LATEST_START, read_camera
-from edslam_ti.datasets.files import image_size, numbered_files, read_depth, read_image, read_numbers
+from edslam_ti.datasets.files import (
+    cache_folder,
+    image_size,
+    numbered_files,
+    read_depth,
+    read_image,
+    read_numbers,
+)
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 from edslam_ti.output import atomic_file
@@ -170,8 +175,8 @@ def open_text_events(path: Path, width: int, height: int) -> EventFile:
     if status.st_size == 0:
         raise DataError(f"{path}: the file is empty; expected lines 't x y p'")
     identity = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}"
-    cache = Path(os.environ.get("EDSLAM_CACHE") or platformdirs.user_cache_dir("edslam_ti"))
-    binary = cache / "events" / f"{path.parent.name}_{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npy"
+    digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
+    binary = cache_folder() / "events" / f"{path.parent.name}_{digest}.npy"
     if not binary.is_file():
         if status.st_size > SLOW_TO_PARSE:
             print(f"reading {path} once ({status.st_size / 1e6:.0f} MB) ...", file=sys.stderr)
