@@ -24,7 +24,7 @@ RANKS: list[list[str]] = [
     ["edslam_ti.frame", "edslam_ti.tracking", "edslam_ti.keyframes", "edslam_ti.mapping"],
     ["edslam_ti.slam"],
     ["edslam_ti.baselines.*", "edslam_ti.evaluation", "edslam_ti.export", "edslam_ti.visualization"],
-    ["edslam_ti.command_line", "edslam_ti.pipeline"],
+    ["edslam_ti.command_line", "edslam_ti.results", "edslam_ti.pipeline"],
     ["apps.*"],
 ]
 
@@ -51,7 +51,7 @@ LIBRARIES: dict[str, list[str]] = {
     "skimage": ["edslam_ti.evaluation"],
     "lpips": ["edslam_ti.evaluation"],
     "matplotlib": ["edslam_ti.visualization"],
-    "rich": ["edslam_ti.datasets.*", "edslam_ti.pipeline", "apps.*"],
+    "rich": ["edslam_ti.datasets.*", "edslam_ti.results", "edslam_ti.pipeline", "apps.*"],
     "psutil": ["edslam_ti.pipeline"],
     "tyro": ["edslam_ti.command_line", "apps.*"],
 }

@@ -15,12 +15,13 @@ import yaml
 from rich.console import Console
 from sequences import settings
 
-from edslam_ti import pipeline
+from edslam_ti import pipeline, results
 from edslam_ti.command_line import launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
 from edslam_ti.export import read_gaussian_ply
+from edslam_ti.mapping import GaussianMapper
 from edslam_ti.pipeline import held_out_frames, run
 from edslam_ti.slam import Slam
 from edslam_ti.tracking import TrackingResult
@@ -28,7 +29,8 @@ from edslam_ti.trajectory import read_tum
 
 FEW = {"iterations": 1, "initial_iterations": 10, "final_iterations": 10}
 ARTEFACTS = {
-    *("trajectory_tum.txt", "truth_tum.txt", "trajectory.png", "map.ply", "mesh.ply", "points.ply"),
+    *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "trajectory.png"),
+    *("map.ply", "mesh.ply", "points.ply"),
     *("config.yaml", "metrics.json", "log.txt", "renders"),
 }
 KEYS = {
@@ -112,6 +114,22 @@ def test_metrics_have_every_key_and_are_right(result: Path) -> None:
     assert not metrics["is_interrupted"]
 
 
+def test_poses_as_tracked_are_kept_beside_the_corrected_ones(result: Path) -> None:
+    final, tracked = (read_tum(result / f"trajectory{name}_tum.txt") for name in ("", "_frontend"))
+    np.testing.assert_allclose(tracked.timestamps, final.timestamps)
+    moved = np.abs(tracked.poses[:, :3, 3] - final.poses[:, :3, 3]).max()  # by bundle adjustment
+    assert 0 < moved < 0.01
+    assert 0 < metrics_of(result)["ate_frontend_rmse_cm"] < 0.2
+
+
+def test_every_stage_has_its_time(result: Path) -> None:
+    seconds = metrics_of(result)["seconds_per_frame"]
+    assert list(seconds) == ["frame_building", "tracking", "mapping", "refinement", "saving"]
+    assert all(value > 0 for value in seconds.values())
+    assert 14 * sum(seconds.values()) <= metrics_of(result)["wall_s"]
+    assert "seconds per frame: frame_building" in (result / "log.txt").read_text()
+
+
 def test_trajectory_and_truth_have_a_pose_per_frame(result: Path) -> None:
     estimate, truth = (read_tum(result / name) for name in ("trajectory_tum.txt", "truth_tum.txt"))
     assert len(estimate) == 14
@@ -150,8 +168,8 @@ def test_log_says_what_was_run(result: Path) -> None:
 def test_two_results_of_one_second_do_not_meet(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a-2").mkdir()
-    assert pipeline._unused(tmp_path / "a") == tmp_path / "a-3"
-    assert pipeline._unused(tmp_path / "b") == tmp_path / "b"
+    assert results._unused(tmp_path / "a") == tmp_path / "a-3"
+    assert results._unused(tmp_path / "b") == tmp_path / "b"
 
 
 def test_held_out_frames_have_depth_and_are_never_the_first() -> None:
@@ -287,13 +305,13 @@ def test_interrupt_saves_what_there_is_and_exits_130(
 def test_interrupt_while_refining_stops_it(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = pipeline.GaussianMapper.finish
+    original = GaussianMapper.finish
 
     def finish(self: Any, trajectory: Any, progress: Callable[[float], bool]) -> None:
         signal.raise_signal(signal.SIGINT)
         original(self, trajectory, progress)
 
-    monkeypatch.setattr(pipeline.GaussianMapper, "finish", finish)
+    monkeypatch.setattr(GaussianMapper, "finish", finish)
     config = config_for(tiny_folder, tmp_path, duration=0.3, mapping={"final_iterations": 100_000})
     with pytest.raises(KeyboardInterrupt):
         quiet_run(config)
@@ -319,7 +337,7 @@ def test_failed_saving_leaves_no_half_written_folder(
     def fail(*arguments: Any, **options: Any) -> None:
         raise error
 
-    monkeypatch.setattr(pipeline, "plot_trajectory", fail)
+    monkeypatch.setattr(results, "plot_trajectory", fail)
     config = config_for(tiny_folder, tmp_path, duration=0.2, mapping={"enabled": False})
     with pytest.raises(type(error)):
         quiet_run(config)
