@@ -13,6 +13,7 @@ import tyro
 from rich.progress import Progress
 
 from edslam_ti.command_line import launch, parse_arguments
+from edslam_ti.simulation.catalogue import ROOM_NAMES
 from edslam_ti.simulation.command import Placement, record
 from edslam_ti.simulation.settings import SimulationConfig
 
@@ -35,7 +36,7 @@ def simulate(
 
     Args:
         out: folder that receives the recording (replaced when it exists)
-        scene: built-in room: room0, room2, office0, office2, office3
+        scene: built-in room (room0, room2, office0, office2, office3) or test scene (wall, corridor)
         mesh: textured or vertex-coloured mesh file instead of a room
         mesh_scale: factor from the mesh's unit to metres
         trajectory: camera-to-world path, TUM format; rooms have a path of their own
@@ -64,7 +65,7 @@ def simulate(
         f"{written.folder}: {written.duration:g} s, {written.num_events} events, "
         f"{written.num_depth_images} depth images, {written.num_images} images"
     )
-    if scene:
+    if scene in ROOM_NAMES:
         print(f"'{scene}' is a procedural stand-in for EventReplica's scene, not Replica")
 
 

@@ -15,6 +15,7 @@ from edslam_ti.errors import ConfigError, DataError
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.simulation import (
     ROOM_NAMES,
+    SCENE_NAMES,
     HandHeldPath,
     RecordedPath,
     Room,
@@ -147,13 +148,44 @@ def test_room_is_closed_and_textured(name: str) -> None:
         assert (np.ptp(blocks, axis=(2, 3)) > 0.1).mean() > 0.85
 
 
+def test_wall_is_flat_textured_and_fills_the_view() -> None:
+    room = cached_room("wall")
+    config = SimulationConfig(width=120, height=76)
+    renderer = Renderer(room.scene, config.camera)
+    for seed in (0, 1):
+        path = HandHeldPath(room, 6.0, seed)
+        for t in (0.0, 1.3, 2.5, 4.1):
+            T = path.pose(t)
+            render = renderer.render(T)
+            v, u = np.mgrid[0:76, 0:120]
+            rays = np.stack([(u - config.camera.cx) / 60, (v - config.camera.cy) / 60, np.ones_like(u)], -1)
+            points = (rays * render.depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+            assert (render.depth > 0).all()
+            np.testing.assert_allclose(points[..., 1], 2.5, atol=1e-4)
+            blocks = np.log(render.grey[:72, :120] + 0.004).reshape(6, 12, 10, 12).swapaxes(1, 2)
+            assert (np.ptp(blocks, axis=(2, 3)) > 0.1).mean() > 0.95
+
+
+def test_corridor_is_long_and_has_less_texture_than_a_room() -> None:
+    config = SimulationConfig(width=120, height=76)
+
+    def contrast(name: str) -> float:
+        room = cached_room(name)
+        render = Renderer(room.scene, config.camera).render(HandHeldPath(room, 6.0, seed=0).pose(1.0))
+        assert (render.depth > 0).all()
+        assert name != "corridor" or render.depth.max() > 9
+        return float(np.median(np.abs(np.diff(np.log(render.grey + 0.004), axis=1))))
+
+    assert contrast("corridor") < 0.6 * contrast("office0")
+
+
 def test_room_is_the_same_every_time(office: Room) -> None:
     first, again = office.scene, make_room("office0").scene
     np.testing.assert_array_equal(first.vertices, again.vertices)
     np.testing.assert_array_equal(first.texture_table().texels, again.texture_table().texels)
 
 
-@pytest.mark.parametrize("name", ROOM_NAMES)
+@pytest.mark.parametrize("name", SCENE_NAMES)
 def test_path_is_hand_held_and_clear_of_furniture(name: str) -> None:
     o3d = load_open3d()
     room = cached_room(name)
@@ -170,8 +202,9 @@ def test_path_is_hand_held_and_clear_of_furniture(name: str) -> None:
         turn = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1))) / 0.02
         assert 0.25 < speed.mean() < 0.6
         assert 0.6 < speed.max() < 1.6
-        assert 15 < turn.mean() < 60
-        assert 50 < turn.max() < 200
+        slowest = 15 if name in ROOM_NAMES else 8  # little to look at on either side
+        assert slowest < turn.mean() < 60
+        assert 3 * slowest < turn.max() < 200
 
 
 def test_recording_has_the_published_layout(recording: Path) -> None:

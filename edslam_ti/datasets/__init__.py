@@ -32,9 +32,9 @@ def find_sequence(config: Config) -> tuple[str, Path | None]:
         return config.dataset, folder
     if config.dataset is None and folder is not None and is_event_replica(folder):
         return "event_replica", folder
-    from edslam_ti.simulation.rooms import ROOM_NAMES
+    from edslam_ti.simulation.catalogue import SCENE_NAMES
 
-    if config.scene in ROOM_NAMES:
+    if config.scene in SCENE_NAMES:
         return "builtin", None
     raise _not_found(config)
 
@@ -50,11 +50,13 @@ def open_sequence(config: Config) -> EventDepthSequence:
     if folder is not None:
         return DATASETS[dataset](folder, config)
     from edslam_ti.datasets.builtin import builtin_sequence_folder
+    from edslam_ti.simulation.catalogue import ROOM_NAMES
 
+    description = f"built-in simulated room '{config.scene}', a stand-in for EventReplica's scene"
     sequence = EventReplicaSequence(
         builtin_sequence_folder(config.scene),
         config.contrast_threshold,
-        description=f"built-in simulated room '{config.scene}', a stand-in for EventReplica's scene",
+        description=description if config.scene in ROOM_NAMES else None,  # others describe themselves
     )
     sequence.dataset, sequence.scene = "builtin", config.scene
     return sequence
@@ -69,11 +71,11 @@ def _scene_folder(config: Config) -> Path | None:
 
 def _not_found(config: Config) -> ConfigError:
     """Say what there is instead."""
-    from edslam_ti.simulation.rooms import ROOM_NAMES
+    from edslam_ti.simulation.catalogue import SCENE_NAMES
 
     wanted = f"scene '{config.scene}' not found in {config.data_dir}"
     if config.dataset == "builtin":
-        return ConfigError(f"no built-in room '{config.scene}'; there are {', '.join(ROOM_NAMES)}")
+        return ConfigError(f"no built-in room '{config.scene}'; there are {', '.join(SCENE_NAMES)}")
     if not config.data_dir.is_dir():
         wanted += " (there is no such folder)"
     elif is_event_replica(config.data_dir) or (config.data_dir / "events.txt").is_file():
@@ -86,11 +88,11 @@ def _not_found(config: Config) -> ConfigError:
         hint = "; it looks like --dataset rpg" if (folder / "events.txt").is_file() else ""
         return ConfigError(f"{folder}: no event_threshold_<C> folder as in EventReplica's layout{hint}")
     there = _scenes_in(config)
-    choices = there + ([] if config.dataset else list(ROOM_NAMES))
+    choices = there + ([] if config.dataset else list(SCENE_NAMES))
     close = difflib.get_close_matches(config.scene, choices, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     found = f"sequences there: {', '.join(there) or 'none'}"
-    builtin = "" if config.dataset else f"; built-in rooms: {', '.join(ROOM_NAMES)}"
+    builtin = "" if config.dataset else f"; built-in rooms: {', '.join(SCENE_NAMES)}"
     return ConfigError(f"{wanted}{hint}; {found}{builtin}")
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 import kernels
 from edslam_ti.errors import ConfigError
+from edslam_ti.simulation.catalogue import make_room
 from edslam_ti.simulation.mesh import load_mesh
 from edslam_ti.simulation.paths import CameraPath, HandHeldPath, RecordedPath, look_at
 from edslam_ti.simulation.recording import RecordingSummary, simulate
-from edslam_ti.simulation.rooms import make_room
 from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.trajectory import read_tum
 

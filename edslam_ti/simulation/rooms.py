@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edslam_ti.errors import DataError
 from edslam_ti.simulation import furniture as f
 from edslam_ti.simulation import lighting
 from edslam_ti.simulation import textures as tx
@@ -106,10 +105,11 @@ class RoomBuilder(SceneBuilder):
         sights: list[Point],
         ambient: float,
         brightness: float,
+        description: str | None = None,
     ) -> Room:
         """Bake the light and return the room."""
         light = lighting.bake(self, self.lamps, ambient, brightness, seed=1)
-        description = f"procedural stand-in for EventReplica's '{name}', not Replica"
+        description = description or f"procedural stand-in for EventReplica's '{name}', not Replica"
         return Room(
             name,
             self.build(description, light),
@@ -123,17 +123,19 @@ def _point(vector: np.ndarray) -> Point:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-def _tiled(b: SceneBuilder, image: np.ndarray, texel: float = 0.004, turned: bool = False) -> Material:
+def tiled(b: SceneBuilder, image: np.ndarray, texel: float = 0.004, turned: bool = False) -> Material:
+    """Return a material that repeats an image, `texel` metres a pixel."""
     return Material(b.texture(image), texel=texel, turned=turned)
 
 
-def _stretched(b: SceneBuilder, image: np.ndarray) -> Material:
+def stretched(b: SceneBuilder, image: np.ndarray) -> Material:
+    """Return a material that shows an image once over a whole face."""
     return Material(b.texture(image, repeat=False), texel=None)
 
 
-def _door(b: RoomBuilder, p: f.Palette, side: str, along: float) -> None:
+def door(b: RoomBuilder, p: f.Palette, side: str, along: float) -> None:
     """Add a panelled door in its frame."""
-    leaf = _stretched(b, tx.panelled(b.rng, tx.wood(b.rng, 0.5, 0.1), 3, 2, handles=False))
+    leaf = stretched(b, tx.panelled(b.rng, tx.wood(b.rng, 0.5, 0.1), 3, 2, handles=False))
     with b.wall(side, along):
         b.box((-0.45, -0.03, 0), (0.45, -0.001, 2.05), p.light_wood, front=leaf, back=None)
         for x in (-0.53, 0.45):
@@ -147,18 +149,18 @@ def _office0() -> Room:
     b = RoomBuilder(100, 4.8, 4.4, 2.7)
     rng = b.rng
     p = f.make_palette(b, wood=0.42, dark=0.2, light=0.62, cloth=(0.3, "weave"), accent=(0.17, "weave"))
-    wall = _tiled(b, tx.plaster(rng, 0.66))
-    papered = _tiled(b, tx.wallpaper(rng, 0.52, "lattice"))
+    wall = tiled(b, tx.plaster(rng, 0.66))
+    papered = tiled(b, tx.wallpaper(rng, 0.52, "lattice"))
     b.shell(
         {"north": wall, "south": wall, "east": papered, "west": wall},
-        _tiled(b, tx.carpet(rng, 0.33)),
-        _tiled(b, tx.ceiling(rng, 0.8, panels=True)),
+        tiled(b, tx.carpet(rng, 0.33)),
+        tiled(b, tx.ceiling(rng, 0.8, panels=True)),
         p.white,
     )
     for x in (1.5, 3.3):
         for y in (1.4, 3.0):
             b.lamp_panel(x, y, (1.2, 0.3), 0.55, p.metal)
-    drawers = _stretched(b, tx.panelled(rng, tx.wood(rng, 0.45), 3, 1))
+    drawers = stretched(b, tx.panelled(rng, tx.wood(rng, 0.45), 3, 1))
     with b.wall("north", 0.15):
         f.desk(b, p, drawers, 1.9)
         f.workplace(b, p, 1.9, 2)
@@ -192,7 +194,7 @@ def _office0() -> Room:
         f.window(b, tx.window_view(rng, "town"), 2.3, 0.95, 1.6, 1.25, p.white)
         f.curtain(b, tx.curtain(rng, 0.5), 1.2, 0.55, 2.4, 0.75)
         f.curtain(b, tx.curtain(rng, 0.5), 3.4, 0.55, 2.4, 0.75)
-        b.box((1.6, -0.12, 0.12), (3.0, -0.03, 0.7), p.white, front=_stretched(b, tx.radiator(rng)))
+        b.box((1.6, -0.12, 0.12), (3.0, -0.03, 0.7), p.white, front=stretched(b, tx.radiator(rng)))
         f.picture(b, tx.pinboard(rng), 0.5, 1.6, 0.8, 0.6)
     b.window_light("west", 2.3, 0.95, 1.6, 1.25, 1.1)
     with b.wall("west", 3.75):
@@ -202,8 +204,8 @@ def _office0() -> Room:
     with b.wall("south", 0.4):
         f.bookshelf(b, p, 1.3, 1.9, 5)
     with b.wall("south", 1.9):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.metal(rng, 0.55), 4, 1)), p.metal, 0.5, 1.32, 0.55)
-    _door(b, p, "south", 3.4)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.metal(rng, 0.55), 4, 1)), p.metal, 0.5, 1.32, 0.55)
+    door(b, p, "south", 3.4)
     with b.wall("south"):
         f.picture(b, tx.poster(rng), 2.2, 1.85, 0.5, 0.7)
     f.bin_(b, p, 2.25, 3.75)
@@ -230,18 +232,18 @@ def _office2() -> Room:
     b = RoomBuilder(102, 6.2, 5.0, 2.9)
     rng = b.rng
     p = f.make_palette(b, wood=0.55, dark=0.28, light=0.72, cloth=(0.22, "stripes"), accent=(0.38, "weave"))
-    brick = _tiled(b, tx.brick(rng, 0.33), texel=0.0036)
-    wall = _tiled(b, tx.plaster(rng, 0.72))
+    brick = tiled(b, tx.brick(rng, 0.33), texel=0.0036)
+    wall = tiled(b, tx.plaster(rng, 0.72))
     b.shell(
-        {"north": brick, "south": wall, "east": wall, "west": _tiled(b, tx.wallpaper(rng, 0.6, "stripes"))},
-        _tiled(b, tx.planks(rng, 0.46)),
-        _tiled(b, tx.ceiling(rng, 0.82, panels=True)),
+        {"north": brick, "south": wall, "east": wall, "west": tiled(b, tx.wallpaper(rng, 0.6, "stripes"))},
+        tiled(b, tx.planks(rng, 0.46)),
+        tiled(b, tx.ceiling(rng, 0.82, panels=True)),
         p.dark_wood,
     )
     for x in (1.6, 4.6):
         for y in (1.2, 3.6):
             b.lamp_panel(x, y, (0.6, 1.2), 0.75, p.white)
-    drawers = _stretched(b, tx.panelled(rng, tx.metal(rng, 0.6), 3, 1))
+    drawers = stretched(b, tx.panelled(rng, tx.metal(rng, 0.6), 3, 1))
     for along, screens in ((0.5, 2), (2.45, 2), (4.35, 1)):
         with b.wall("north", along):
             f.desk(b, p, drawers, 1.7)
@@ -271,9 +273,9 @@ def _office2() -> Room:
     with b.wall("east", 3.0):
         f.box_pile(b, p)
     with b.wall("west", 0.3):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.metal(rng, 0.5), 4, 1)), p.metal, 0.55, 1.4, 0.6)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.metal(rng, 0.5), 4, 1)), p.metal, 0.55, 1.4, 0.6)
     with b.wall("west", 0.95):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.metal(rng, 0.5), 1, 2)), p.metal, 0.9, 1.9, 0.45)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.metal(rng, 0.5), 1, 2)), p.metal, 0.9, 1.9, 0.45)
     with b.wall("west", 2.0):
         f.bookshelf(b, p, 1.6, 1.75, 5)
     with b.wall("west"):
@@ -284,7 +286,7 @@ def _office2() -> Room:
         f.vase(b, p, 0.25, -0.22, 0.7, 0.3, 0.1)
         with b.placed(0.5, -0.3, 0.7):
             f.stack_of_books(b, p, 4)
-    _door(b, p, "south", 1.2)
+    door(b, p, "south", 1.2)
     with b.wall("south", 2.2):
         f.bookshelf(b, p, 1.8, 2.1, 6)
     with b.wall("south"):
@@ -314,12 +316,12 @@ def _office3() -> Room:
     b = RoomBuilder(103, 5.6, 5.2, 2.7)
     rng = b.rng
     p = f.make_palette(b, wood=0.34, dark=0.15, light=0.5, cloth=(0.45, "tartan"), accent=(0.28, "stripes"))
-    wall = _tiled(b, tx.plaster(rng, 0.58))
-    panels = _tiled(b, tx.wood(rng, 0.4, 0.15), turned=True)
+    wall = tiled(b, tx.plaster(rng, 0.58))
+    panels = tiled(b, tx.wood(rng, 0.4, 0.15), turned=True)
     b.shell(
-        {"north": panels, "south": wall, "east": wall, "west": _tiled(b, tx.wallpaper(rng, 0.48, "petals"))},
-        _tiled(b, tx.tiles(rng, 0.52)),
-        _tiled(b, tx.ceiling(rng, 0.76, panels=False)),
+        {"north": panels, "south": wall, "east": wall, "west": tiled(b, tx.wallpaper(rng, 0.48, "petals"))},
+        tiled(b, tx.tiles(rng, 0.52)),
+        tiled(b, tx.ceiling(rng, 0.76, panels=False)),
         p.dark_wood,
     )
     for x in (1.3, 2.8, 4.3):
@@ -327,7 +329,7 @@ def _office3() -> Room:
     with b.wall("north", 2.8):
         f.television(b, p, 1.7, 1.05)
     with b.wall("north", 1.5):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.3), 1, 4)), p.dark_wood, 2.6, 0.7, 0.45)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.3), 1, 4)), p.dark_wood, 2.6, 0.7, 0.45)
         f.vase(b, p, 0.2, -0.2, 0.7, 0.32, 0.1)
         for x in (0.6, 1.2, 1.9):
             with b.placed(x, -0.32, 0.7, yaw=float(rng.uniform(-10, 10))):
@@ -374,14 +376,14 @@ def _office3() -> Room:
         f.curtain(b, tx.curtain(rng, 0.36), 4.4, 0.5, 2.45)
         f.picture(b, tx.framed(tx.portrait(rng), 0.15), 1.6, 1.6, 0.55, 0.68)
         f.picture(b, tx.whiteboard(rng), 0.7, 1.6, 0.8, 0.55)
-        b.box((2.75, -0.12, 0.12), (4.05, -0.03, 0.7), p.white, front=_stretched(b, tx.radiator(rng)))
+        b.box((2.75, -0.12, 0.12), (4.05, -0.03, 0.7), p.white, front=stretched(b, tx.radiator(rng)))
     b.window_light("west", 3.4, 0.9, 1.5, 1.35, 1.0)
     with b.wall("west", 0.3):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.42), 3, 2)), p.wood, 1.2, 0.95, 0.45)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.42), 3, 2)), p.wood, 1.2, 0.95, 0.45)
         f.desk_lamp(b, p, 0.25, -0.2, 0.95)
         with b.placed(0.6, -0.3, 0.95, yaw=-8):
             b.box((0, 0, 0), (0.4, 0.26, 0.22), p.cardboard)
-    _door(b, p, "south", 1.0)
+    door(b, p, "south", 1.0)
     with b.wall("south", 2.2):
         f.sofa(b, p, 1.9, 2)
     with b.wall("south"):
@@ -410,17 +412,17 @@ def _room0() -> Room:
     b = RoomBuilder(110, 5.4, 5.0, 2.6)
     rng = b.rng
     p = f.make_palette(b, wood=0.38, dark=0.18, light=0.58, cloth=(0.42, "weave"), accent=(0.3, "tartan"))
-    wall = _tiled(b, tx.plaster(rng, 0.7))
+    wall = tiled(b, tx.plaster(rng, 0.7))
     b.shell(
-        {"north": _tiled(b, tx.wallpaper(rng, 0.55, "petals")), "south": wall, "east": wall, "west": wall},
-        _tiled(b, tx.planks(rng, 0.4)),
-        _tiled(b, tx.ceiling(rng, 0.85, panels=False)),
+        {"north": tiled(b, tx.wallpaper(rng, 0.55, "petals")), "south": wall, "east": wall, "west": wall},
+        tiled(b, tx.planks(rng, 0.4)),
+        tiled(b, tx.ceiling(rng, 0.85, panels=False)),
         p.white,
     )
     b.lamp_panel(2.7, 2.6, (1.0, 1.0), 1.6, p.dark_wood)
     b.lamp_panel(1.0, 4.2, (0.35, 0.35), 0.35, p.metal)
     b.lamp_panel(4.4, 4.2, (0.35, 0.35), 0.35, p.metal)
-    rug = _stretched(b, tx.rug(rng, 0.5))
+    rug = stretched(b, tx.rug(rng, 0.5))
     with b.placed(1.35, 3.75):
         b.box((0, -1.7, 0), (2.6, 0, 0.012), p.fabric, top=rug)
     with b.wall("north", 1.5):
@@ -432,7 +434,7 @@ def _room0() -> Room:
         f.floor_lamp(b, p, 1.15, -0.35)
         f.plant(b, p, 4.15, -0.4, 1.25, 30)
     with b.wall("north", 0.15):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.4), 3, 1)), p.wood, 0.65, 0.6, 0.45)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.4), 3, 1)), p.wood, 0.65, 0.6, 0.45)
         f.vase(b, p, 0.2, -0.2, 0.6, 0.3, 0.1)
         with b.placed(0.36, -0.3, 0.6):
             f.stack_of_books(b, p, 3)
@@ -448,7 +450,7 @@ def _room0() -> Room:
     with b.wall("east", 0.6):
         f.bookshelf(b, p, 1.4, 2.05, 6)
     with b.wall("east", 2.15):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.3), 1, 3)), p.dark_wood, 1.6, 0.55, 0.45)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.3), 1, 3)), p.dark_wood, 1.6, 0.55, 0.45)
         with b.placed(0.3, -0.32, 0.55):
             f.stack_of_books(b, p, 3)
         f.vase(b, p, 1.4, -0.2, 0.55, 0.34, 0.1)
@@ -463,10 +465,10 @@ def _room0() -> Room:
         f.picture(b, tx.framed(tx.landscape(rng), 0.45), 0.9, 1.6, 0.8, 0.6)
     b.window_light("west", 3.0, 0.85, 1.7, 1.35, 1.3)
     with b.wall("west", 0.3):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.45), 2, 2)), p.light_wood, 1.2, 0.8, 0.42)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.45), 2, 2)), p.light_wood, 1.2, 0.8, 0.42)
         f.desk_lamp(b, p, 0.25, -0.2, 0.8)
         f.plant(b, p, 0.85, -0.2, 0.5, 18, z=0.8)
-    _door(b, p, "south", 4.3)
+    door(b, p, "south", 4.3)
     with b.wall("south", 0.5):
         f.bookshelf(b, p, 1.1, 1.2, 3)
     with b.wall("south"):
@@ -501,11 +503,11 @@ def _room2() -> Room:
     b = RoomBuilder(112, 5.8, 4.8, 2.65)
     rng = b.rng
     p = f.make_palette(b, wood=0.5, dark=0.25, light=0.68, cloth=(0.5, "stripes"), accent=(0.25, "dots"))
-    wall = _tiled(b, tx.wallpaper(rng, 0.62, "stripes"))
+    wall = tiled(b, tx.wallpaper(rng, 0.62, "stripes"))
     b.shell(
-        {"north": wall, "south": wall, "east": _tiled(b, tx.plaster(rng, 0.5)), "west": wall},
-        _tiled(b, tx.planks(rng, 0.55, boards=8)),
-        _tiled(b, tx.ceiling(rng, 0.84, panels=False)),
+        {"north": wall, "south": wall, "east": tiled(b, tx.plaster(rng, 0.5)), "west": wall},
+        tiled(b, tx.planks(rng, 0.55, boards=8)),
+        tiled(b, tx.ceiling(rng, 0.84, panels=False)),
         p.light_wood,
     )
     b.lamp_panel(1.7, 2.8, (0.7, 0.7), 1.0, p.white)
@@ -515,9 +517,7 @@ def _room2() -> Room:
     with b.wall("north"):
         for x in (0.15, 2.4):
             with b.placed(x):
-                f.cabinet(
-                    b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.5), 2, 1)), p.wood, 0.48, 0.52, 0.4
-                )
+                f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.5), 2, 1)), p.wood, 0.48, 0.52, 0.4)
         f.desk_lamp(b, p, 0.4, -0.15, 0.52)
         with b.placed(2.5, -0.3, 0.52):
             f.stack_of_books(b, p, 4)
@@ -527,7 +527,7 @@ def _room2() -> Room:
         f.curtain(b, tx.curtain(rng, 0.4), 3.3, 0.45, 2.45)
         f.curtain(b, tx.curtain(rng, 0.4), 5.1, 0.45, 2.45)
     b.window_light("north", 4.2, 0.9, 1.4, 1.3, 1.2)
-    rug = _stretched(b, tx.rug(rng, 0.42))
+    rug = stretched(b, tx.rug(rng, 0.42))
     with b.placed(2.9, 4.1):
         b.box((0, -1.5, 0), (2.3, 0, 0.012), p.fabric, top=rug)
     with b.placed(3.45, 3.85):
@@ -546,7 +546,7 @@ def _room2() -> Room:
     with b.wall("east", 1.4):
         f.bookshelf(b, p, 1.5, 1.9, 5)
     with b.wall("east", 3.0):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.45), 4, 2)), p.wood, 1.1, 1.0, 0.5)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.45), 4, 2)), p.wood, 1.1, 1.0, 0.5)
         f.vase(b, p, 0.3, -0.25, 1.0, 0.34, 0.11)
         with b.placed(0.6, -0.35, 1.0, yaw=-6):
             b.box((0, 0, 0), (0.36, 0.26, 0.2), p.cardboard)
@@ -555,15 +555,15 @@ def _room2() -> Room:
         f.picture(b, tx.framed(tx.portrait(rng), 0.2), 3.6, 1.85, 0.5, 0.62)
         f.picture(b, tx.clock(rng), 4.4, 2.0, 0.32, 0.32)
     with b.wall("west", 1.4):
-        f.cabinet(b, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.55), 1, 3)), p.light_wood, 1.8, 2.2, 0.6)
+        f.cabinet(b, stretched(b, tx.panelled(rng, tx.wood(rng, 0.55), 1, 3)), p.light_wood, 1.8, 2.2, 0.6)
     with b.wall("west", 0.2):
         f.box_pile(b, p)
     with b.wall("west"):
         f.picture(b, tx.framed(tx.abstract(rng), 0.2), 3.9, 1.65, 0.7, 0.7)
         f.picture(b, tx.poster(rng), 0.7, 1.65, 0.55, 0.78)
-    _door(b, p, "south", 4.9)
+    door(b, p, "south", 4.9)
     with b.wall("south", 0.6):
-        f.desk(b, p, _stretched(b, tx.panelled(rng, tx.wood(rng, 0.5), 3, 1)), 1.6)
+        f.desk(b, p, stretched(b, tx.panelled(rng, tx.wood(rng, 0.5), 3, 1)), 1.6)
         f.workplace(b, p, 1.6, 1)
     with b.wall("south", 2.4):
         f.bookshelf(b, p, 1.2, 1.7, 4)
@@ -587,17 +587,10 @@ def _room2() -> Room:
     )
 
 
-_ROOMS: dict[str, Callable[[], Room]] = {
+ROOMS: dict[str, Callable[[], Room]] = {
     "room0": _room0,
     "room2": _room2,
     "office0": _office0,
     "office2": _office2,
     "office3": _office3,
 }
-
-
-def make_room(name: str) -> Room:
-    """Return a built-in room; the same name always gives the same room."""
-    if name not in _ROOMS:
-        raise DataError(f"scene '{name}': no such built-in room; choose from {', '.join(ROOM_NAMES)}")
-    return _ROOMS[name]()

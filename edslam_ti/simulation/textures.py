@@ -38,6 +38,26 @@ def plaster(rng: np.random.Generator, base: float, contrast: float = 0.05) -> Ar
     return base * (1 + contrast * (0.6 * grain + 0.8 * blotches))
 
 
+def mural(rng: np.random.Generator, height: int = 2048, width: int = 3072) -> Array:
+    """A painted wall without repeats: grain of every size under overlapping discs and bars."""
+    image = 0.45 * (1 + 0.18 * noise(rng, height, width, 1.2) + 0.06 * noise(rng, height, width, 0.4))
+    for _ in range(height * width // 12_000):
+        size = float(rng.uniform(12, 70))
+        reach = int(1.5 * size) + 1
+        cy, cx = int(rng.integers(reach, height - reach)), int(rng.integers(reach, width - reach))
+        y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+        if rng.random() < 0.5:
+            inside = np.hypot(x, y) < size / 2
+        else:
+            angle = rng.uniform(0, np.pi)
+            along = x * np.cos(angle) + y * np.sin(angle)
+            across = y * np.cos(angle) - x * np.sin(angle)
+            inside = (np.abs(along) < size) & (np.abs(across) < size / 6)
+        patch = image[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1]
+        patch[inside] *= rng.uniform(0.35, 1.9)
+    return np.clip(image, 0.04, 0.96).astype(np.float32)
+
+
 def wallpaper(rng: np.random.Generator, base: float, pattern: str) -> Array:
     """Wallpaper with stripes, a damask of petals, or a lattice."""
     y, x = np.mgrid[0:512, 0:512] / 512.0

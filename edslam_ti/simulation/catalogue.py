@@ -1,0 +1,16 @@
+"""Built-in scenes by name: the five rooms that stand in for EventReplica's, and scenes kept for tests."""
+
+from edslam_ti.errors import DataError
+from edslam_ti.simulation.rooms import ROOM_NAMES, ROOMS, Room
+from edslam_ti.simulation.unseen import UNSEEN_SCENES
+
+UNSEEN_NAMES = tuple(UNSEEN_SCENES)
+SCENE_NAMES = (*ROOM_NAMES, *UNSEEN_NAMES)
+
+
+def make_room(name: str) -> Room:
+    """Return a built-in scene; the same name always gives the same scene."""
+    builders = ROOMS | UNSEEN_SCENES
+    if name not in builders:
+        raise DataError(f"scene '{name}': no such built-in scene; choose from {', '.join(SCENE_NAMES)}")
+    return builders[name]()
