@@ -176,7 +176,7 @@ def test_corridor_is_long_and_has_less_texture_than_a_room() -> None:
         assert name != "corridor" or render.depth.max() > 9
         return float(np.median(np.abs(np.diff(np.log(render.grey + 0.004), axis=1))))
 
-    assert contrast("corridor") < 0.6 * contrast("office0")
+    assert contrast("corridor") < 0.75 * contrast("office0")
 
 
 def test_room_is_the_same_every_time(office: Room) -> None:
