@@ -4,6 +4,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -24,6 +25,16 @@ class Sample:
     T_world_camera: np.ndarray | None = None  # [4, 4] truth, for evaluation only
 
 
+@dataclass(frozen=True)
+class NovelView:
+    """A true view from beside the path; for evaluation only."""
+
+    timestamp: float  # seconds; the path's pose that it lies beside
+    image: np.ndarray  # [H, W] float32 in [0, 1]
+    depth: np.ndarray  # [H, W] float32 metres, exact, 0 = missing
+    T_world_camera: np.ndarray  # [4, 4]
+
+
 class EventDepthSequence(ABC):
     """Streams of events and depth, with images and true poses where the data has them.
 
@@ -39,6 +50,7 @@ class EventDepthSequence(ABC):
     depth_timestamps: np.ndarray  # [D] seconds, strictly increasing
     image_timestamps: np.ndarray  # [I] seconds, strictly increasing; may be empty
     description: str  # one line: what this is; a stand-in says so
+    surfaces_file: Path | None = None  # true surfaces of a simulated scene, a PLY mesh; for evaluation only
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
 
     @abstractmethod
@@ -57,6 +69,10 @@ class EventDepthSequence(ABC):
     @abstractmethod
     def time_range(self) -> tuple[float, float]:
         """Times of the first and the last event in seconds."""
+
+    def novel_views(self) -> list[NovelView]:
+        """Return the true views beside the path, in the order of time; data without any has none."""
+        return []
 
     def image_at(self, timestamp: float, tolerance: float = 1e-3) -> np.ndarray | None:
         """Return the image taken within `tolerance` seconds of a time, if there is one."""

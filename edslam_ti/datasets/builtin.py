@@ -5,6 +5,7 @@ from pathlib import Path
 
 from edslam_ti.datasets.files import cache_folder
 from edslam_ti.simulation import HandHeldPath, SimulationConfig, make_room, simulate
+from edslam_ti.simulation.truth import write_evaluation_truth
 
 GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
 
@@ -19,12 +20,17 @@ def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) 
     key = f"{GENERATOR_VERSION} {settings.model_dump_json()}"
     version = hashlib.sha256(key.encode()).hexdigest()[:12]
     folder = cache_folder() / "sequences" / version / scene
-    if folder.is_dir():  # folders appear whole or not at all
+    if (folder / "novel_views").is_dir():  # folders appear whole or not at all
         return folder
     from rich.progress import Progress
 
     room = make_room(scene)
     path = HandHeldPath(room, settings.duration, settings.seed, settings.speed)
+    if folder.is_dir():  # simulated before recordings held views beside the path
+        write_evaluation_truth(
+            folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
+        )
+        return folder
     with Progress(transient=True) as bar:
         task = bar.add_task(f"simulating {scene} (first use)", total=1.0)
         simulate(room.scene, path, settings, folder, lambda share: bar.update(task, completed=share))

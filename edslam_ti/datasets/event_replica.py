@@ -7,6 +7,9 @@
     depth/frameNNNNNN.png                      16 bits, 1/depth_scale metres, 0 = missing; or
     Depth_exr/*.exr                            metres (used when there is no depth/frame*.png)
     camera.json                                optional
+    novel_views/{images,depth}/frameNNNNNN.png, novel_views/traj.txt
+                                               true views beside the path (same units), optional
+    surfaces.ply                               true surfaces, metres, optional
 
 NNNNNN is the time in milliseconds, with any number of digits. `camera.json` may hold any of {width,
 height, fx, fy, cx, cy, pixel_centres: "integer" | "half", contrast_threshold, depth_scale}; what it leaves
@@ -26,7 +29,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from edslam_ti.camera import Camera
-from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.datasets.base import EventDepthSequence, NovelView
 from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.datasets.files import numbered_files, read_depth, read_image, read_numbers
 from edslam_ti.errors import DataError
@@ -117,6 +120,9 @@ class EventReplicaSequence(EventDepthSequence):
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
+        self._folder = folder
+        surfaces = folder / "surfaces.ply"
+        self.surfaces_file = surfaces if surfaces.is_file() else None
         calibration = read_camera(folder / "camera.json")
         self.description = description or calibration.description or f"EventReplica layout, {folder}"
         self.camera = calibration.camera
@@ -159,6 +165,29 @@ class EventReplicaSequence(EventDepthSequence):
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
         return read_image(self._image_files[index], self.camera)
+
+    def novel_views(self) -> list[NovelView]:
+        folder = self._folder / "novel_views"
+        if not folder.is_dir():
+            return []
+        images, depths = (numbered_files(folder / name, "frame*", (".png",)) for name in ("images", "depth"))
+        poses_file = folder / "traj.txt"
+        poses = read_numbers(poses_file, 16, "the 4x4 matrix T_world_camera, row by row").reshape(-1, 4, 4)
+        check_rigid(poses, poses_file)
+        if list(images) != list(depths) or len(images) != len(poses):
+            raise DataError(
+                f"{folder}: expected an image, a depth image of the same name and a pose for every view, got "
+                f"{len(images)} images, {len(depths)} depth images and {len(poses)} poses"
+            )
+        return [
+            NovelView(
+                ms / 1000 - self.time_offset,
+                read_image(images[ms], self.camera),
+                read_depth(depths[ms], self.camera, self._metres_per_unit),
+                orthonormalized(T),
+            )
+            for ms, T in zip(images, poses)
+        ]
 
     def _with_times(self, files: dict[int, Path]) -> tuple[list[Path], np.ndarray]:
         """Return the files and their times (s), from milliseconds in their names."""

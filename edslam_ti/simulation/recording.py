@@ -5,6 +5,7 @@ images/frameNNNNNN.png          grey, 8 bit; NNNNNN = milliseconds
 depth/frameNNNNNN.png           uint16, 5000 units per metre, 0 = missing
 event_threshold_C/gray_events_data.npy    [N, 4] float64: x, y, t (s), polarity -1/+1, sorted by time
 camera.json, README.txt         intrinsics and settings; what this is
+novel_views/, surfaces.ply      for evaluation only, see truth.py
 """
 
 import json
@@ -23,9 +24,9 @@ from edslam_ti.simulation.paths import CameraPath
 from edslam_ti.simulation.renderer import Render, Renderer
 from edslam_ti.simulation.scene import Scene
 from edslam_ti.simulation.settings import SimulationConfig
+from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_truth
 from kernels.event_simulation import EventArrays, EventSensorState, simulate_events
 
-DEPTH_UNITS_PER_METRE = 5000  # of the depth PNG; reaches to 13.1 m
 MILLISECOND = 1_000_000  # nanoseconds
 HEADER_BYTES = 128  # of the event file
 
@@ -105,6 +106,7 @@ def simulate(
             images.finish()
         _write_poses(folder, path, image_times)
         _write_descriptions(folder, scene, config)
+        write_evaluation_truth(folder, scene, config.camera, config.samples_per_pixel, path.pose, end / 1e9)
     return RecordingSummary(out, events.count, num_frames, len(image_times), len(depth_times), duration)
 
 
@@ -297,6 +299,7 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "File names are milliseconds; depth may be at other times than the poses.\n"
         "gray_events_data.npy: float64 rows x, y, t (s), polarity -1/+1, sorted by time; a change of\n"
         f"log(grey + {config.log_epsilon:.6g}) by the contrast threshold fires an event, grey in [0, 1].\n"
-        "Pixel centres are at integer coordinates.\n\n"
+        "Pixel centres are at integer coordinates.\n"
+        "novel_views/: true views beside the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
         f"Settings:\n{settings}\n"
     )
