@@ -22,6 +22,7 @@ from edslam_ti.simulation import (
     SimulationConfig,
     load_mesh,
     look_at,
+    make_path,
     make_room,
     simulate,
 )
@@ -205,6 +206,61 @@ def test_path_is_hand_held_and_clear_of_furniture(name: str) -> None:
         slowest = 15 if name in ROOM_NAMES else 8  # little to look at on either side
         assert slowest < turn.mean() < 60
         assert 3 * slowest < turn.max() < 200
+
+
+@pytest.mark.parametrize("name", [n for n in SCENE_NAMES if n != "wall"])
+def test_loop_turns_around_returns_and_stays_clear_of_furniture(name: str) -> None:
+    o3d = load_open3d()
+    room = cached_room(name)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(room.scene.vertices), o3d.core.Tensor(room.scene.triangles))
+    path = make_path(room, SimulationConfig(path="loop", duration=30.0, seed=1))
+    poses = np.array([path.pose(t) for t in np.arange(0, 30.01, 0.05)])
+    positions = poses[:, :3, 3].astype(np.float32)
+    assert scene.compute_distance(o3d.core.Tensor(positions)).numpy().min() > 0.25
+    assert 8 < np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() < 18
+    np.testing.assert_allclose(path.pose(30.0), path.pose(0.0), atol=1e-9)
+    forward = poses[:, :3, 2]
+    np.testing.assert_array_less((forward @ forward[0]).min(), -0.8)  # looks behind on the way
+
+
+def test_loop_needs_a_closed_room() -> None:
+    with pytest.raises(DataError, match="expected a closed room, got scene 'wall'"):
+        make_path(cached_room("wall"), SimulationConfig(path="loop"))
+
+
+def test_rotation_turns_on_the_spot(office: Room) -> None:
+    path = make_path(office, SimulationConfig(path="rotation"))
+    poses = np.array([path.pose(t) for t in (0.0, 0.5, 1.0)])
+    np.testing.assert_array_equal(poses[1:, :3, 3], poses[:2, :3, 3])
+    assert np.degrees(np.arccos(poses[0, :3, 2] @ poses[2, :3, 2])) > 10
+
+
+def test_stop_and_go_rests_without_a_tremor(office: Room) -> None:
+    path = make_path(office, SimulationConfig(path="stop_and_go"))
+    np.testing.assert_array_equal(path.pose(1.0), path.pose(1.6))  # STOP
+    assert np.linalg.norm(path.pose(1.6)[:3, 3] - path.pose(2.6)[:3, 3]) > 0.05  # GO
+
+
+def test_recording_can_lose_a_stretch_of_each_stream(office: Room, tmp_path: Path) -> None:
+    settings = TINY.model_copy(update={"event_gap": (0.1, 0.08), "depth_gap": (0.08, 0.05)})
+    simulate(office.scene, HandHeldPath(office, TINY.duration), settings, tmp_path / "gaps")
+    t = read_events(tmp_path / "gaps")[:, 2]
+    assert not ((t >= 0.1) & (t < 0.18)).any()
+    assert ((t >= 0.18) & (t < 0.19)).any()
+    depths = sorted(p.name for p in (tmp_path / "gaps" / "depth").glob("*.png"))
+    assert depths == [f"frame000{t:03d}.png" for t in (0, 50, 150, 200, 250, 300)]
+
+
+def test_compact_events_and_dense_poses(office: Room, recording: Path, tmp_path: Path) -> None:
+    settings = TINY.model_copy(update={"compact_events": True, "pose_rate": 100.0})
+    simulate(office.scene, HandHeldPath(office, TINY.duration), settings, tmp_path / "compact")
+    full, compact = read_events(recording), read_events(tmp_path / "compact")
+    assert compact.dtype == np.float32
+    np.testing.assert_array_equal(compact[:, [0, 1, 3]], full[:, [0, 1, 3]])
+    np.testing.assert_allclose(compact[:, 2], full[:, 2], rtol=0, atol=3e-8)  # float32 below 0.5 s
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "compact" / "poses_ts.txt"), np.arange(31) * 0.01)
+    np.testing.assert_allclose(read_poses(tmp_path / "compact")[::5], read_poses(recording), atol=1e-12)
 
 
 def test_recording_has_the_published_layout(recording: Path) -> None:

@@ -4,10 +4,15 @@ import hashlib
 from pathlib import Path
 
 from edslam_ti.datasets.files import cache_folder
-from edslam_ti.simulation import HandHeldPath, SimulationConfig, make_room, simulate
+from edslam_ti.simulation import SimulationConfig, make_path, make_room, simulate
 from edslam_ti.simulation.truth import write_evaluation_truth
 
 GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
+
+
+# Settings added after GENERATOR_VERSION was last raised: at their defaults they change nothing, and
+# recordings made before them stay valid.
+NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events")
 
 
 def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) -> Path:
@@ -17,7 +22,7 @@ def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) 
     setting, so changed settings never meet old data.
     """
     settings = config or SimulationConfig()
-    key = f"{GENERATOR_VERSION} {settings.model_dump_json()}"
+    key = f"{GENERATOR_VERSION} {settings.model_dump_json(exclude=_unchanged(settings))}"
     version = hashlib.sha256(key.encode()).hexdigest()[:12]
     folder = cache_folder() / "sequences" / version / scene
     if (folder / "novel_views").is_dir():  # folders appear whole or not at all
@@ -25,7 +30,7 @@ def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) 
     from rich.progress import Progress
 
     room = make_room(scene)
-    path = HandHeldPath(room, settings.duration, settings.seed, settings.speed)
+    path = make_path(room, settings)
     if folder.is_dir():  # simulated before recordings held views beside the path
         write_evaluation_truth(
             folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
@@ -35,3 +40,8 @@ def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) 
         task = bar.add_task(f"simulating {scene} (first use)", total=1.0)
         simulate(room.scene, path, settings, folder, lambda share: bar.update(task, completed=share))
     return folder
+
+
+def _unchanged(settings: SimulationConfig) -> set[str]:
+    fields = SimulationConfig.model_fields
+    return {name for name in NEW_SETTINGS if getattr(settings, name) == fields[name].default}

@@ -2,7 +2,7 @@
 
 from edslam_ti.simulation.catalogue import SCENE_NAMES, UNSEEN_NAMES, make_room
 from edslam_ti.simulation.mesh import load_mesh
-from edslam_ti.simulation.paths import CameraPath, HandHeldPath, RecordedPath, look_at
+from edslam_ti.simulation.paths import CameraPath, HandHeldPath, RecordedPath, look_at, make_path
 from edslam_ti.simulation.recording import RecordingSummary, simulate
 from edslam_ti.simulation.rooms import ROOM_NAMES, Room
 from edslam_ti.simulation.scene import Scene
@@ -21,6 +21,7 @@ __all__ = [
     "SimulationConfig",
     "load_mesh",
     "look_at",
+    "make_path",
     "make_room",
     "simulate",
 ]

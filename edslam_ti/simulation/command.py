@@ -10,7 +10,7 @@ import kernels
 from edslam_ti.errors import ConfigError
 from edslam_ti.simulation.catalogue import make_room
 from edslam_ti.simulation.mesh import load_mesh
-from edslam_ti.simulation.paths import CameraPath, HandHeldPath, RecordedPath, look_at
+from edslam_ti.simulation.paths import CameraPath, RecordedPath, look_at, make_path
 from edslam_ti.simulation.recording import RecordingSummary, simulate
 from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.trajectory import read_tum
@@ -71,5 +71,5 @@ def record(
         room = make_room(scene_name or "")
         scene = room.scene
         if trajectory is None:
-            path = HandHeldPath(room, config.duration, config.seed, config.speed)
+            path = make_path(room, config)
     return simulate(scene, path, config, out, progress)

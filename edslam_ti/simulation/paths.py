@@ -9,6 +9,7 @@ from scipy.special import erf
 
 from edslam_ti.errors import DataError
 from edslam_ti.simulation.rooms import Room
+from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.trajectory import Trajectory
 
 TYPICAL_SPEED = 0.4  # m/s, mean over a long path
@@ -16,7 +17,12 @@ REACH = (0.55, 0.45, 0.22)  # metres, largest excursion along x, y, z
 DWELL = 1.2  # seconds from one sight to the next
 BURST_WIDTH = 0.17  # seconds, Gaussian width of a fast stretch
 MOVE_BURST, GAZE_BURST = 0.9, 1.6  # extra speed in a fast stretch, as a share of the normal speed
+UP = np.array([0.0, 0.0, 1.0])
 BURST_INTERVAL = (1.7, 2.6)  # seconds from one fast stretch to the next
+
+
+GO, STOP = 1.0, 0.6  # seconds of motion and of rest on a stop-and-go path
+TURN_DURATION = 30.0  # seconds of a loop path for about one turn
 
 
 class CameraPath(Protocol):
@@ -113,10 +119,93 @@ class HandHeldPath:
         tremor = self._tremor(t)
         position = self._centre + self._position(self._clock(t, MOVE_BURST)) + tremor[:3]
         s = self._clock(t, GAZE_BURST)
-        T = look_at(position, self._target(s), np.array([0.0, 0.0, 1.0]))
-        roll, pitch, yaw = np.radians(tremor[3:] + (self._roll(s)[0], 0, 0))
-        T[:3, :3] = T[:3, :3] @ _axis_rotation(1, yaw) @ _axis_rotation(0, pitch) @ _axis_rotation(2, roll)
+        T = look_at(position, self._target(s), UP)
+        return _turned(T, tremor[3:] + (self._roll(s)[0], 0, 0))
+
+
+class RotationPath:
+    """A hand-held path's turns about the point where it starts; nothing moves sideways."""
+
+    def __init__(self, hand_held: HandHeldPath) -> None:
+        self.duration = hand_held.duration
+        self._hand_held = hand_held
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera at a time in seconds."""
+        T = self._hand_held.pose(t)
+        T[:3, 3] = self._hand_held.pose(0.0)[:3, 3]
         return T
+
+
+class StopAndGoPath:
+    """A hand-held path that rests for STOP seconds after every GO seconds of motion, tremor and all."""
+
+    def __init__(self, hand_held: HandHeldPath) -> None:
+        self.duration = hand_held.duration
+        self._hand_held = hand_held
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera at a time in seconds; speed rises and falls smoothly (smoothstep)."""
+        rounds, rest = divmod(t, GO + STOP)
+        u = min(rest / GO, 1.0)
+        return self._hand_held.pose(GO * (rounds + 3 * u**2 - 2 * u**3))
+
+
+class LoopPath:
+    """An ellipse around the free box while the gaze turns full circle, and back to the first pose.
+
+    One turn of the gaze takes about TURN_DURATION, so that what is seen first comes back only at the end.
+    """
+
+    def __init__(self, room: Room, duration: float, seed: int = 0, speed: float = 1.0) -> None:
+        if not room.is_closed:
+            raise DataError(
+                f"path 'loop' looks in every direction: expected a closed room, got scene '{room.name}'; "
+                "use another scene or path"
+            )
+        rng = np.random.default_rng([seed, zlib.crc32(room.name.encode()), 1])
+        self.duration = duration
+        self._centre = (room.free_low + room.free_high) / 2
+        self._half = 0.9 * (room.free_high - room.free_low) / 2 * (1, 1, 0.5)
+        a, b = self._half[:2]
+        round_length = np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))  # Ramanujan
+        self._rounds = max(1, round(duration * speed * TYPICAL_SPEED / round_length))
+        self._turns = max(1, round(duration * speed / TURN_DURATION))
+        self._phase = float(rng.uniform(0, 2 * np.pi))
+        self._direction = float(rng.choice([-1, 1]))
+        self._wobble = rng.uniform(0, 2 * np.pi, 3)
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera at a time in seconds; the same at 0 and at `duration`."""
+        u = 2 * np.pi * t / self.duration
+        angle = self._rounds * u + self._phase
+        turns = 7 * self._turns  # of the wobbles: whole numbers, so that the path closes
+        offset = self._half * (np.cos(angle), np.sin(angle), np.sin(2 * angle))
+        position = self._centre + offset + 0.01 * np.sin(3 * turns * u + self._wobble)
+        yaw = self._phase + self._direction * self._turns * u + 0.25 * np.sin(turns * u + self._wobble[0])
+        pitch = -0.15 + 0.15 * np.sin(2 * turns * u + self._wobble[1])
+        forward = (np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch))
+        roll = 4 * np.sin(turns * u + self._wobble[2])
+        return _turned(look_at(position, position + forward, UP), np.array([roll, 0.0, 0.0]))
+
+
+def make_path(room: Room, config: SimulationConfig) -> CameraPath:
+    """Return the kind of path that the settings ask for."""
+    if config.path == "loop":
+        return LoopPath(room, config.duration, config.seed, config.speed)
+    hand_held = HandHeldPath(room, config.duration, config.seed, config.speed)
+    if config.path == "rotation":
+        return RotationPath(hand_held)
+    return StopAndGoPath(hand_held) if config.path == "stop_and_go" else hand_held
+
+
+def _turned(T: np.ndarray, degrees: np.ndarray) -> np.ndarray:  # [4, 4], [3] roll, pitch, yaw -> [4, 4]
+    """Return a pose turned about its own axes."""
+    roll, pitch, yaw = np.radians(degrees)
+    result = T.copy()
+    R = T[:3, :3] @ _axis_rotation(1, yaw) @ _axis_rotation(0, pitch) @ _axis_rotation(2, roll)
+    result[:3, :3] = R
+    return result
 
 
 def _axis_rotation(axis: int, angle: float) -> np.ndarray:  # [3, 3]

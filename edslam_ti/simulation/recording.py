@@ -1,9 +1,9 @@
 """A scene and a camera path become a recording on disk in EventReplica's layout.
 
-poses_ts.txt, traj.txt          time (s) and camera-to-world pose (16 numbers, OpenCV axes) of every image
+poses_ts.txt, traj.txt          times (s) and camera-to-world poses (16 numbers, OpenCV axes), one per image
 images/frameNNNNNN.png          grey, 8 bit; NNNNNN = milliseconds
 depth/frameNNNNNN.png           uint16, 5000 units per metre, 0 = missing
-event_threshold_C/gray_events_data.npy    [N, 4] float64: x, y, t (s), polarity -1/+1, sorted by time
+event_threshold_C/gray_events_data.npy    [N, 4] float64 (or float32): x, y, t (s), polarity -1/+1, by time
 camera.json, README.txt         intrinsics and settings; what this is
 novel_views/, surfaces.ply      for evaluation only, see truth.py
 """
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,9 @@ def simulate(
     """
     duration = min(config.duration, path.duration)
     image_times = _millisecond_times(config.image_rate, duration)
-    depth_times = _millisecond_times(config.depth_rate, duration)
+    depth_times = [
+        t for t in _millisecond_times(config.depth_rate, duration) if not _is_in(config.depth_gap, t)
+    ]
     if min(len(image_times), len(depth_times)) < 2:
         raise DataError(
             f"recording of {duration:g} s: expected at least two images and two depth images; "
@@ -78,25 +81,25 @@ def simulate(
         log_now = _log_intensity(render, config)
         state = EventSensorState.start(log_now)
         depths.add(now, render)
-        with EventFileWriter(threshold / "gray_events_data.npy") as events:
+        file = threshold / "gray_events_data.npy"
+        with EventFileWriter(file, np.float32 if config.compact_events else np.float64) as events:
             while now < end:
                 following = times.after(now, render.depth)
                 render_next = renderer.render(path.pose(following / 1e9))
                 log_next = _log_intensity(render_next, config)
-                events.append(
-                    simulate_events(
-                        log_now,
-                        log_next,
-                        now,
-                        following,
-                        state,
-                        config.contrast_threshold,
-                        config.negative_contrast_threshold or config.contrast_threshold,
-                        config.threshold_noise,
-                        round(config.refractory_period * 1e9),
-                        config.seed,
-                    )
+                fired = simulate_events(
+                    log_now,
+                    log_next,
+                    now,
+                    following,
+                    state,
+                    config.contrast_threshold,
+                    config.negative_contrast_threshold or config.contrast_threshold,
+                    config.threshold_noise,
+                    round(config.refractory_period * 1e9),
+                    config.seed,
                 )
+                events.append(_without_gap(fired, config.event_gap))
                 images.add(now, render.grey, following, render_next.grey)
                 depths.add(following, render_next)
                 now, render, log_now = following, render_next, log_next
@@ -104,7 +107,10 @@ def simulate(
                 if progress:
                     progress(now / end)
             images.finish()
-        _write_poses(folder, path, image_times)
+        pose_times = image_times
+        if config.pose_rate is not None:
+            pose_times = _millisecond_times(config.pose_rate, duration)
+        _write_poses(folder, path, pose_times)
         _write_descriptions(folder, scene, config)
         write_evaluation_truth(folder, scene, config.camera, config.samples_per_pixel, path.pose, end / 1e9)
     return RecordingSummary(out, events.count, num_frames, len(image_times), len(depth_times), duration)
@@ -119,6 +125,19 @@ def _millisecond_times(rate: float, duration: float) -> list[int]:
     count = int(np.floor(duration * rate + 1e-6)) + 1
     stamps = [round(1e3 * k / rate) * MILLISECOND for k in range(count)]
     return sorted({t for t in stamps if t <= round(duration * 1e9)})
+
+
+def _is_in(gap: tuple[float, float] | None, t: int) -> bool:
+    """Return whether a time in nanoseconds lies in a gap (start and length in seconds)."""
+    return gap is not None and gap[0] <= t / 1e9 < gap[0] + gap[1]
+
+
+def _without_gap(events: EventArrays, gap: tuple[float, float] | None) -> EventArrays:
+    if gap is None:
+        return events
+    seconds = events.t / 1e9
+    kept = (seconds < gap[0]) | (seconds >= gap[0] + gap[1])
+    return EventArrays(events.x[kept], events.y[kept], events.t[kept], events.polarity[kept])
 
 
 class _FrameTimes:
@@ -165,16 +184,17 @@ class _FrameTimes:
 
 
 class EventFileWriter:
-    """Appends events to an .npy file [N, 4] float64 whose length is filled in at the end."""
+    """Appends events to an .npy file [N, 4] whose length is filled in at the end."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, dtype: type[np.floating[Any]] = np.float64) -> None:
         self.count = 0
+        self._dtype = np.dtype(dtype)
         self._file = path.open("wb")
         self._file.write(b"\0" * HEADER_BYTES)
 
     def append(self, events: EventArrays) -> None:
         """Write events as rows x, y, t (s), polarity."""
-        rows = np.empty((len(events.t), 4))
+        rows = np.empty((len(events.t), 4), self._dtype)
         rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = events.x, events.y, events.t / 1e9, events.polarity
         self._file.write(rows.tobytes())
         self.count += len(rows)
@@ -185,7 +205,7 @@ class EventFileWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({self.count}, 4), }}"
+        text = f"{{'descr': '{self._dtype.str}', 'fortran_order': False, 'shape': ({self.count}, 4), }}"
         prefix = np.lib.format.magic(1, 0) + (HEADER_BYTES - 10).to_bytes(2, "little")
         self._file.seek(0)
         self._file.write(prefix + text.ljust(HEADER_BYTES - 11).encode("latin1") + b"\n")
@@ -267,7 +287,7 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 
 
 def _write_poses(folder: Path, path: CameraPath, times: list[int]) -> None:
-    """Write one time and one pose per image."""
+    """Write times and poses, one a line."""
     with (folder / "poses_ts.txt").open("w") as stamps, (folder / "traj.txt").open("w") as poses:
         for t in times:
             stamps.write(f"{t / 1e9:.6f}\n")
@@ -294,10 +314,10 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
     (folder / "README.txt").write_text(
         f"Simulated recording: {scene.description}.\n\n"
         "poses_ts.txt, traj.txt: seconds and camera-to-world pose (16 numbers, row-major; x right, y down,\n"
-        "z forward) of every image. images/: 8-bit grey. depth/: uint16, "
+        "z forward). images/: 8-bit grey. depth/: uint16, "
         f"{DEPTH_UNITS_PER_METRE} units per metre, 0 = missing.\n"
         "File names are milliseconds; depth may be at other times than the poses.\n"
-        "gray_events_data.npy: float64 rows x, y, t (s), polarity -1/+1, sorted by time; a change of\n"
+        "gray_events_data.npy: rows x, y, t (s), polarity -1/+1, sorted by time; a change of\n"
         f"log(grey + {config.log_epsilon:.6g}) by the contrast threshold fires an event, grey in [0, 1].\n"
         "Pixel centres are at integer coordinates.\n"
         "novel_views/: true views beside the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"

@@ -29,6 +29,7 @@ class Room:
     free_low: np.ndarray  # [3] metres, smallest corner of the box free of furniture
     free_high: np.ndarray  # [3]
     sights: np.ndarray  # [S, 3] metres, in the order in which they are looked at
+    is_closed: bool = True  # there is something to see in every direction
 
 
 class RoomBuilder(SceneBuilder):

@@ -46,6 +46,17 @@ class SimulationConfig(Stage):
     """Rendered frames per second at least (Hz), however slow the motion."""
     speed: float = Field(1.0, gt=0, le=10)
     """Factor on the speed of the built-in path (1: about 0.4 m/s)."""
+    path: Literal["hand_held", "rotation", "stop_and_go", "loop"] = "hand_held"
+    """rotation: the camera turns on the spot; stop_and_go: it stands still for 0.6 s of every 1.6 s;
+    loop: it turns once around (every 30 s or so) and ends where it began."""
+    pose_rate: float | None = Field(None, gt=0, le=1000)
+    """Written true poses per second, milliseconds as for images; omitted: one per image."""
+    event_gap: tuple[float, float] | None = None
+    """Start and length in seconds of a stretch whose events are lost."""
+    depth_gap: tuple[float, float] | None = None
+    """Start and length in seconds of a stretch whose depth images are lost."""
+    compact_events: bool = False
+    """Events as float32: half the disk space; stamps are exact to 0.3 us up to 4 s, 4 us up to a minute."""
     seed: int = Field(0, ge=0)
     """Seed of path, threshold noise and depth noise."""
 

@@ -26,6 +26,7 @@ def _wall() -> Room:
         np.array([x - 0.6, 0.0, z - 0.25]),
         np.array([x + 0.6, 0.9, z + 0.25]),
         np.array([[x + dx, b.depth, z + dz] for dx, dz in _WALL_SIGHTS]),
+        is_closed=False,
     )
 
 
