@@ -9,7 +9,6 @@ from edslam_ti.simulation.truth import write_evaluation_truth
 
 GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
 
-
 # Settings added after GENERATOR_VERSION was last raised: at their defaults they change nothing, and
 # recordings made before them stay valid.
 NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events")
