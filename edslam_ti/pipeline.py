@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 import kernels
 from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
-from edslam_ti.datasets import SampledSequence, open_sequence
+from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping import Mapper
@@ -67,6 +67,12 @@ def run(config: Config, console: Console | None = None) -> Path:
 def _prepare(config: Config) -> Run:
     sequence = open_sequence(config)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
+    slam = make_slam(config, sequence, samples)
+    return Run(config, sequence, samples, slam, held_out_frames(samples, config.evaluation.hold_out_every))
+
+
+def make_slam(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> Slam:
+    """Return the method that the settings name, ready to start at the first sample's true pose."""
     contrast = config.contrast_threshold or sequence.contrast_threshold or DEFAULT_CONTRAST_THRESHOLD
     tracker: Tracker
     tracker, mapper = METHODS[config.method].build(sequence, contrast, config)
@@ -75,13 +81,12 @@ def _prepare(config: Config) -> Run:
             raise DataError(f"{sequence.scene}: --poses truth needs true poses, and this sequence has none")
         tracker = TruePoses(sequence.true_pose)
     truth = sequence.true_pose(float(samples.timestamps[0]))
-    slam = Slam(
+    return Slam(
         FrameBuilder(sequence.camera, config.time_surface),
         tracker,
         mapper if config.mapping.enabled else None,
         initial_pose=np.eye(4) if truth is None else truth,
     )
-    return Run(config, sequence, samples, slam, held_out_frames(samples, config.evaluation.hold_out_every))
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

@@ -174,6 +174,42 @@ def _with_ate(name: str, aligned: AlignedPath) -> str:
 # ---------------------------------------------------------------- renders
 
 
+def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]], label: str) -> None:
+    """Draw every value of every series as a dot, group beside group, and each series' median as a bar."""
+    series = list(dict.fromkeys(name for values in groups.values() for name in values))
+    figure = _figure(max(5.0, 1.0 + 1.4 * len(groups)), 4.0)
+    ax = figure.add_subplot()
+    for k, (name, colour) in enumerate(zip(series, _colours())):
+        shift = 0.8 * ((k + 0.5) / len(series) - 0.5)
+        for place, values in enumerate(groups.values()):
+            shown = values.get(name, [])
+            if shown:
+                spread = np.linspace(-0.25, 0.25, len(shown)) / len(series)
+                ax.plot(place + shift + spread, shown, ".", color=colour, alpha=0.6)
+                middle, half = float(np.median(shown)), 0.35 / len(series)
+                ax.hlines(middle, place + shift - half, place + shift + half, colors=colour, lw=2)
+        ax.plot([], [], "s", color=colour, label=name)
+    ax.set_yscale("log")
+    ax.set_xticks(range(len(groups)), list(groups), rotation=20)
+    ax.set_ylabel(label)
+    ax.grid(axis="y", alpha=0.3)
+    _legend(ax)
+    _save(figure, path)
+
+
+def plot_drift(path: Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Draw the error (cm) over the path travelled (m) of each curve, the first poses laid together."""
+    figure = _figure(7.0, 4.0)
+    ax = figure.add_subplot()
+    for (name, (travelled, error)), colour in zip(curves.items(), _colours()):
+        ax.plot(travelled, error, color=colour, label=name, lw=1)
+    ax.set_xlabel("path travelled [m]")
+    ax.set_ylabel("distance from the truth [cm]")
+    ax.grid(alpha=0.3)
+    _legend(ax)
+    _save(figure, path)
+
+
 def write_render_triptychs(
     folder: Path,
     timestamps: Sequence[float],  # seconds

@@ -25,6 +25,7 @@ RANKS: list[list[str]] = [
     ["edslam_ti.slam"],
     ["edslam_ti.baselines.*", "edslam_ti.evaluation", "edslam_ti.export", "edslam_ti.visualization"],
     ["edslam_ti.command_line", "edslam_ti.results", "edslam_ti.pipeline"],
+    [f"edslam_ti.reproduce{part}" for part in ("", ".cases", ".altered", ".recordings", ".runs", ".report")],
     ["apps.*"],
 ]
 
@@ -51,7 +52,13 @@ LIBRARIES: dict[str, list[str]] = {
     "skimage": ["edslam_ti.evaluation"],
     "lpips": ["edslam_ti.evaluation"],
     "matplotlib": ["edslam_ti.visualization"],
-    "rich": ["edslam_ti.datasets.*", "edslam_ti.results", "edslam_ti.pipeline", "apps.*"],
+    "rich": [
+        "edslam_ti.datasets.*",
+        "edslam_ti.results",
+        "edslam_ti.pipeline",
+        "edslam_ti.reproduce.*",
+        "apps.*",
+    ],
     "psutil": ["edslam_ti.pipeline"],
     "tyro": ["edslam_ti.command_line", "apps.*"],
 }

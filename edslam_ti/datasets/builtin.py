@@ -1,6 +1,7 @@
 """The built-in sequences: simulated once, kept in the user's cache folder."""
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 from edslam_ti.datasets.files import cache_folder
@@ -14,9 +15,14 @@ GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that
 NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events")
 
 
-def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) -> Path:
+def builtin_sequence_folder(
+    scene: str,
+    config: SimulationConfig | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
     """Return the folder of a built-in sequence (EventReplica's layout), simulating it on first use.
 
+    `progress` receives the share simulated, 0 to 1; without it there is a bar on the terminal.
     Taichi must have been started. The folder's name holds a hash of the generator's version and of every
     setting, so changed settings never meet old data.
     """
@@ -34,6 +40,9 @@ def builtin_sequence_folder(scene: str, config: SimulationConfig | None = None) 
         write_evaluation_truth(
             folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
         )
+        return folder
+    if progress is not None:
+        simulate(room.scene, path, settings, folder, progress)
         return folder
     with Progress(transient=True) as bar:
         task = bar.add_task(f"simulating {scene} (first use)", total=1.0)

@@ -5,6 +5,7 @@ from edslam_ti.simulation.rooms import ROOM_NAMES, ROOMS, Room
 from edslam_ti.simulation.unseen import UNSEEN_SCENES
 
 UNSEEN_NAMES = tuple(UNSEEN_SCENES)
+UNSEEN_ROOM_NAMES = tuple(name for name in UNSEEN_NAMES if name not in ("wall", "corridor"))
 SCENE_NAMES = (*ROOM_NAMES, *UNSEEN_NAMES)
 
 

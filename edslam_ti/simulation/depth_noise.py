@@ -46,6 +46,32 @@ def kinect_depth(
     return np.where(lost, 0, z).astype(np.float32)
 
 
+def viewing_cosine(
+    depth: np.ndarray,  # [H, W] metres, exact, 0 = missing
+    camera: Camera,
+) -> np.ndarray:  # [H, W] in [0, 1]
+    """Return the cosine between viewing ray and surface normal as exact depth alone tells it.
+
+    Tangents are differences to the neighbour that is nearer in depth, so that steps do not tilt surfaces.
+    """
+    height, width = camera.shape
+    v, u = np.mgrid[0:height, 0:width]
+    z = depth.astype(np.float64)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(z)], -1)
+    points = rays * z[..., None]  # [H, W, 3]
+    tangents = []
+    for axis in (1, 0):
+        forward = np.diff(points, axis=axis, append=np.take(points, [-1], axis))
+        backward = np.diff(points, axis=axis, prepend=np.take(points, [0], axis))
+        # Beyond the border the difference is zero: never the choice.
+        size = [np.where(np.abs(d).sum(-1) > 0, np.abs(d[..., 2]), np.inf) for d in (forward, backward)]
+        tangents.append(np.where((size[0] <= size[1])[..., None], forward, backward))
+    normals = np.cross(tangents[0], tangents[1])
+    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
+    cosine = np.abs((normals * rays).sum(-1)) / np.maximum(lengths, 1e-12)
+    return np.where(depth > 0, cosine, 0.0)
+
+
 def _edges(depth: np.ndarray) -> np.ndarray:  # [H, W] bool
     """Return pixels beside a depth step (both sides of it)."""
     edge = np.zeros(depth.shape, bool)

@@ -1,0 +1,167 @@
+"""The cases of the tracking bench: which recording, and what is done to it while it is read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from edslam_ti.simulation import ROOM_NAMES, SimulationConfig
+from edslam_ti.simulation.catalogue import UNSEEN_ROOM_NAMES
+
+DURATION = 2.5  # seconds
+LONG_DURATION = 30.0  # seconds, about 10 m
+QUICK_DURATION = 1.2  # seconds
+GAP = (1.0, 0.5)  # start and length in seconds
+POSE_RATE = 200.0  # true poses per second: poses between depth images are judged too
+MEASURED = "measured"  # depth that comes with real data
+RECORDED = "recorded"  # a path that is not simulated
+MESH_SCENE, REAL_SCENE = "viking_room", "slider_depth"  # of the data folder
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What is simulated (once), or read from the data folder: exact depth at 20 Hz."""
+
+    scene: str
+    path: str = "hand_held"
+    speed: float = 1.0
+    seed: int = 0
+    duration: float = DURATION
+
+    @property
+    def settings(self) -> SimulationConfig:
+        """The simulation's settings; a recorded path is no path of a room."""
+        return SimulationConfig(
+            path="hand_held" if self.path == RECORDED else self.path,
+            speed=self.speed,
+            seed=self.seed,
+            duration=self.duration,
+            pose_rate=POSE_RATE,
+            compact_events=True,
+        )
+
+
+@dataclass(frozen=True)
+class Case:
+    """One line of results before seeds are put together."""
+
+    group: str  # what it is a test of
+    recording: Recording
+    depth: str = "exact"  # or kinect, measured
+    rate: float = 20.0  # depth images per second
+    event_gap: tuple[float, float] | None = None
+    depth_gap: tuple[float, float] | None = None
+
+    @property
+    def row(self) -> str:
+        """What all seeds of a case share, readable."""
+        recording = self.recording
+        words = [recording.scene]
+        if recording.path != "hand_held":
+            words.append(recording.path)
+        if recording.duration >= LONG_DURATION:
+            words.append(f"{recording.duration:g}s")
+        if recording.speed != 1:
+            words.append(f"x{recording.speed:g}")
+        if self.event_gap:
+            words.append("event_gap")
+        if self.depth_gap:
+            words.append("depth_gap")
+        return "-".join([*words, self.depth, f"{self.rate:g}hz"])
+
+    @property
+    def name(self) -> str:
+        """A name that serves as a folder name, too."""
+        return f"{self.row}-seed{self.recording.seed}"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which cases to run; an empty tuple takes all."""
+
+    cases: tuple[str, ...] = ()
+    """Parts of case names: wall, gap, 30s, kinect-5hz, ..."""
+    groups: tuple[str, ...] = ()
+    """Groups: rooms, unseen, wall, corridor, rotation, stop_and_go, mesh, gaps, long, real."""
+    scenes: tuple[str, ...] = ()
+    """Scenes: room0, wall, viking_room, slider_depth, ..."""
+    depth: tuple[str, ...] = ()
+    """Depth: exact, kinect, measured."""
+    rates: tuple[float, ...] = ()
+    """Depth images per second: 20, 10, 5."""
+    speeds: tuple[float, ...] = ()
+    """Speed of the motion: 1, 2."""
+    seeds: tuple[int, ...] = ()
+    """Seeds of path and noise: 0, 1, 2."""
+
+    def includes(self, case: Case) -> bool:
+        """Return whether a case passes every filter."""
+        recording = case.recording
+        wanted = (
+            (self.groups, case.group),
+            (self.scenes, recording.scene),
+            (self.depth, case.depth),
+            (self.rates, case.rate),
+            (self.speeds, recording.speed),
+            (self.seeds, recording.seed),
+        )
+        named = not self.cases or any(part in case.name for part in self.cases)
+        return named and all(not values or value in values for values, value in wanted)
+
+
+EVERYTHING = Selection()
+
+
+def all_cases(seeds: Sequence[int] = (0, 1, 2)) -> list[Case]:
+    """Return the whole bench; cases of one recording follow each other."""
+    cases = []
+    for seed in seeds:
+        for scene in ROOM_NAMES:
+            for speed in (1.0, 2.0):
+                recording = Recording(scene, speed=speed, seed=seed)
+                cases += _depths("rooms", recording, rates=(20.0, 10.0, 5.0))
+        for scene in UNSEEN_ROOM_NAMES:
+            cases += _depths("unseen", Recording(scene, seed=seed), rates=(20.0, 5.0))
+        cases += _depths("wall", Recording("wall", seed=seed), rates=(20.0, 5.0))
+        cases += _depths("corridor", Recording("corridor", seed=seed))
+        cases += _depths("rotation", Recording("office0", path="rotation", seed=seed))
+        cases += _depths("stop_and_go", Recording("office2", path="stop_and_go", seed=seed))
+        cases += _depths("mesh", Recording(MESH_SCENE, path=RECORDED, seed=seed))
+        for scene in ("office3", "room0"):
+            recording = Recording(scene, seed=seed)
+            cases.append(Case("gaps", recording, "kinect", event_gap=GAP))
+            cases.append(Case("gaps", recording, "kinect", depth_gap=GAP))
+        for scene, path in (("office0", "loop"), ("room2", "hand_held")):
+            cases.append(Case("long", Recording(scene, path, seed=seed, duration=LONG_DURATION), "kinect"))
+    cases.append(Case("real", Recording(REAL_SCENE, path=RECORDED), MEASURED))
+    cases.sort(key=lambda case: (case.recording.seed, _order(case)))
+    recordings = list(dict.fromkeys(case.recording for case in cases))
+    return sorted(cases, key=lambda case: recordings.index(case.recording))
+
+
+def quick_cases() -> list[Case]:
+    """Return a few short cases that take about three minutes in all."""
+    cases = []
+    for group, scene in (("rooms", "office0"), ("wall", "wall")):
+        recording = Recording(scene, duration=QUICK_DURATION)
+        cases += [Case(group, recording, "kinect", rate) for rate in (20.0, 5.0)]
+    return cases
+
+
+def _depths(group: str, recording: Recording, rates: tuple[float, ...] = (20.0,)) -> list[Case]:
+    return [Case(group, recording, depth, rate) for depth in ("exact", "kinect") for rate in rates]
+
+
+def _order(case: Case) -> int:
+    """Long and special recordings come after the rooms."""
+    groups = (
+        "rooms",
+        "wall",
+        "corridor",
+        "rotation",
+        "stop_and_go",
+        "unseen",
+        "gaps",
+        "mesh",
+        "real",
+        "long",
+    )
+    return groups.index(case.group)
