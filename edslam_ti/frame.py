@@ -21,6 +21,10 @@ class PyramidLevel:
     surface: np.ndarray  # [h, w] float32 in [0, 1]
     depth: np.ndarray  # [h, w] float32 metres, 0 = missing
 
+    @cached_property
+    def surface_and_depth(self) -> np.ndarray:  # [h, w, 2] float32
+        return cv2.merge([self.surface, self.depth])
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -48,22 +52,25 @@ class Frame:
         while len(self._pyramid) <= k:
             last = self._pyramid[-1]
             camera = last.camera.downscaled(2)
-            surface = _blocks(last.surface, camera.shape).mean(-1)
+            a, b, c, d = _corners(last.surface, camera.shape)
+            surface = 0.25 * (a + b + c + d)
             self._pyramid.append(PyramidLevel(camera, surface, _downscaled_depth(last.depth, camera.shape)))
         return self._pyramid[k]
 
 
-def _blocks(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:  # [h, w, 4]
-    """Return the 2x2 block of every pixel of the image at half size."""
+def _corners(image: np.ndarray, shape: tuple[int, int]) -> list[np.ndarray]:  # four [h, w]
+    """Return the four pixels under every pixel of the image at half size."""
     h, w = shape
-    return image[: 2 * h, : 2 * w].reshape(h, 2, w, 2).swapaxes(1, 2).reshape(h, w, 4)
+    return [image[y : 2 * h : 2, x : 2 * w : 2] for y in (0, 1) for x in (0, 1)]
 
 
 def _downscaled_depth(depth: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return block means where all four depths exist and lie on one surface, else missing."""
-    blocks = _blocks(depth, shape)
-    low, high = blocks.min(-1), blocks.max(-1)
-    return np.where((low > 0) & (high - low < 0.05 * high), blocks.mean(-1), 0).astype(np.float32)
+    """Return means of four where all four depths exist and lie on one surface, else missing."""
+    a, b, c, d = _corners(depth, shape)
+    low = np.minimum(np.minimum(a, b), np.minimum(c, d))
+    high = np.maximum(np.maximum(a, b), np.maximum(c, d))
+    is_smooth = (low > 0) & (high - low < 0.05 * high)
+    return np.where(is_smooth, 0.25 * (a + b + c + d), np.float32(0))
 
 
 class FrameBuilder:

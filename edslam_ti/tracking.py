@@ -5,13 +5,20 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-import torch
+from torch import Tensor
 
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame
-from edslam_ti.geometry import orthonormalized, se3_exp, skew
+from edslam_ti.geometry import exp_matrix, orthonormalized, rigid_inverse
 from edslam_ti.trajectory import Trajectory
-from kernels.patch_warp import NormalEquations, Patches, ResidualModel, extract_patches, normal_equations
+from kernels.patch_warp import (
+    Alignment,
+    Direction,
+    NormalEquations,
+    ResidualModel,
+    adjoint,
+    extract_patches,
+)
 
 MIN_PIXELS = 200  # fewer residuals than this constrain no pose
 MAX_CONDITION = 1e7  # of the normal equations: beyond, some motion is not observed
@@ -54,7 +61,7 @@ class _Reference:
     """A frame to align to, with its patches at every pyramid level."""
 
     frame: Frame
-    patches: list[Patches]
+    points: list[Tensor]  # [blocks, 4, LANES] each, from `Patches.points`
     has_surface: bool  # False: too few events yet, only its depth can be aligned
 
 
@@ -62,6 +69,32 @@ class _Reference:
 class _Alignment:
     T_world_camera: np.ndarray
     system: NormalEquations  # at the finest level
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Normal equations of one frame at one pyramid level, as a function of its pose."""
+
+    alignment: Alignment
+    references: list[np.ndarray]  # [4, 4] T_world_camera of each
+    is_bidirectional: bool
+
+    def linearise(self, T_world_camera: np.ndarray) -> NormalEquations:  # [4, 4]
+        """Return Eq. 5's normal equations over all references, for T_world_camera <- T exp(xi)."""
+        # T_camera_reference <- exp(-xi) T_camera_reference, so that its unknown is -xi; and
+        # T_reference_camera exp(xi) = exp(Ad(T_reference_camera) xi) T_reference_camera.
+        poses, unknowns = [], []
+        for T_world_reference in self.references:
+            T_reference_camera = rigid_inverse(T_world_reference) @ T_world_camera
+            poses.append(rigid_inverse(T_reference_camera))
+            unknowns.append(-np.eye(6))
+            if self.is_bidirectional:
+                poses.append(T_reference_camera)
+                unknowns.append(adjoint(T_reference_camera))
+        first, *rest = (
+            system.transformed(unknown) for system, unknown in zip(self.alignment.linearise(poses), unknowns)
+        )
+        return sum(rest, start=first)
 
 
 class BidirectionalPatchTracker:
@@ -159,14 +192,14 @@ class BidirectionalPatchTracker:
         level: int,
     ) -> tuple[np.ndarray, NormalEquations]:
         T, damping = T_world_camera, 1e-4
-        system = self._system(current, references, T, level)
+        problem = self._problem(current, references, level)
+        system = problem.linearise(T)
         for _ in range(self._config.iterations):
             if system.num_surface < MIN_PIXELS:
                 break
-            H = system.H + damping * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
-            step = -np.linalg.solve(H, system.g)
-            candidate_T = T @ se3_exp(torch.from_numpy(step)).numpy()
-            candidate = self._system(current, references, candidate_T, level)
+            H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
+            candidate_T = T @ exp_matrix(-np.linalg.solve(H, system.g))
+            candidate = problem.linearise(candidate_T)
             gain = 1 - _mean_cost(candidate) / _mean_cost(system)
             if gain > 0:
                 T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
@@ -178,41 +211,22 @@ class BidirectionalPatchTracker:
                     break
         return T, system
 
-    def _system(
-        self,
-        current: _Reference,
-        references: list[tuple[_Reference, np.ndarray]],
-        T_world_camera: np.ndarray,
-        level: int,
-    ) -> NormalEquations:
-        """Return Eq. 5's normal equations over all references, for T_world_camera <- T exp(xi)."""
+    def _problem(
+        self, current: _Reference, references: list[tuple[_Reference, np.ndarray]], level: int
+    ) -> "_Problem":
+        """Return Eq. 5 over all references, both directions: source <- target and target <- source."""
         now = current.frame.level(level)
-        total: NormalEquations | None = None
-        for reference, T_world_reference in references:
-            then = reference.frame.level(level)
-            T_reference_camera = np.linalg.inv(T_world_reference) @ T_world_camera
-            T_camera_reference = np.linalg.inv(T_reference_camera)
-            intrinsics = now.camera.intrinsics
+        directions: list[Direction] = []
+        for view, (reference, _) in enumerate(references, start=1):
             model = self._model if reference.has_surface and current.has_surface else self._depth_only
-            # source <- target and target <- source: both directions of Eq. 5
-            system = normal_equations(
-                reference.patches[level], now.surface, now.depth, T_camera_reference, intrinsics,
-                model, inverse=True,
-            )  # fmt: skip
+            directions.append(Direction(reference.points[level], 0, model))
             if current.frame.depth is not None:
-                system += normal_equations(
-                    current.patches[level], then.surface, then.depth, T_reference_camera, intrinsics,
-                    model,
-                )  # fmt: skip
-            # The twist acts on the reference's side; exp(xi_r) T = T exp(Ad(T^-1) xi_r).
-            A = adjoint(T_reference_camera)
-            system = NormalEquations(
-                A.T @ system.H @ A, A.T @ system.g, system.cost,
-                system.num_surface, system.num_depth, system.num_usable,
-            )  # fmt: skip
-            total = system if total is None else total + system
-        assert total is not None
-        return total
+                directions.append(Direction(current.points[level], view, model))
+        views = [now, *(reference.frame.level(level) for reference, _ in references)]
+        alignment = Alignment(
+            directions, np.stack([view.surface_and_depth for view in views]), now.camera.intrinsics
+        )
+        return _Problem(alignment, [T for _, T in references], current.frame.depth is not None)
 
     def _with_patches(self, frame: Frame) -> _Reference:
         """Draw patches where the time surface exceeds its threshold and depth is known.
@@ -227,22 +241,19 @@ class BidirectionalPatchTracker:
         rows, columns = np.nonzero(on_surface if has_surface else has_depth)
         chosen = self._random.permutation(len(rows))[: config.num_patches]
         centres = np.stack([columns[chosen], rows[chosen]], -1)
-        patches = []
+        points = []
         for k in range(config.levels):
             level = frame.level(k)
             size = config.patch_size if k == 0 else max(3, config.patch_size // 2 | 1)
-            at_level = np.unique(centres >> k, axis=0) if k else centres
-            patches.append(extract_patches(level.surface, level.depth, at_level.astype(np.int32), size))
-        return _Reference(frame, patches, has_surface)
+            at_level = _distinct(centres >> k) if k else centres
+            patches = extract_patches(level.surface, level.depth, at_level.astype(np.int32), size)
+            points.append(patches.points(level.camera.intrinsics))
+        return _Reference(frame, points, has_surface)
 
 
-def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]
-    """Return Ad(T) for twists (translation, rotation): T exp(xi) = exp(Ad(T) xi) T."""
-    R, t = T[:3, :3], T[:3, 3]
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = skew(torch.from_numpy(t)).numpy() @ R
-    return result
+def _distinct(centres: np.ndarray) -> np.ndarray:  # [P, 2] of non-negative int64
+    """Return the different rows, in order: `np.unique(centres, axis=0)` without its sort of records."""
+    return np.stack(np.divmod(np.unique(centres[:, 0] << 32 | centres[:, 1]), 1 << 32), -1)
 
 
 def _mean_cost(system: NormalEquations) -> float:

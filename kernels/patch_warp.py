@@ -9,36 +9,43 @@ T = T_b_a, K the pinhole projection pi and S bilinear sampling:
 
 Both residuals are divided by their standard deviation and weighted by Huber's function; Eq. 5 sums
 unsquared norms, and this is its smooth least-squares form. The unknown is a twist xi, order
-(translation, rotation), that updates T_b_a <- exp(xi) T_b_a. Aligning b's patches to view a uses the
-inverse transform with the same unknown, so that both directions add up in one system.
+(translation, rotation), that updates T_b_a <- exp(xi) T_b_a.
+
+All patches of all directions are linearised in one launch, sixteen pixels at a time (kernels.lanes):
+points of view a and their Jacobians are vectors, only the corners of the bilinear samples are fetched
+pixel by pixel.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import taichi as ti
+import torch
 
-from kernels.runtime import check_shape
+from kernels.lanes import LANES, lanes, vector_instructions, zeros
+from kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
-PARTS = 1024  # partial sums, in a fixed partition: the same bits for any number of threads
+PART = 32  # blocks of LANES pixels to a partial sum: a fixed partition, the same bits for any threads
+PARTS_PER_WORKER = 24  # fewer are done before another core has woken up
 NEAR = 0.05  # metres
 # Columns of a partial sum: 21 entries of H (upper triangle, row by row), 6 of g, then
 COST, NUM_SURFACE, NUM_DEPTH, NUM_USABLE = 27, 28, 29, 30
 SUM_SIZE = 31
+# Columns of a job: T_b_a (three rows of four), then
+FX, FY, CX, CY, MAX_DEPTH_DIFFERENCE, SURFACE_SIGMA = 12, 13, 14, 15, 16, 17
+DEPTH_WEIGHT, DEPTH_SIGMA, DEPTH_SIGMA_2, HUBER_THRESHOLD = 18, 19, 20, 21
+JOB_SIZE = 22
 
 
 @ti.func
 def bilinear(image: ti.template(), x, y):
-    """Value and gradient (per pixel) at (x, y), and the least of the four corners; all inside."""
+    """Value at (x, y), all four corners inside."""
     i, j = ti.cast(ti.floor(y), ti.i32), ti.cast(ti.floor(x), ti.i32)
     fx, fy = x - j, y - i
     a, b = image[i, j], image[i, j + 1]
     c, d = image[i + 1, j], image[i + 1, j + 1]
     top, bottom = a + fx * (b - a), c + fx * (d - c)
-    gradient = ti.Vector([(1 - fy) * (b - a) + fy * (d - c), bottom - top])
-    lowest = ti.min(ti.min(a, b), ti.min(c, d))
-    highest = ti.max(ti.max(a, b), ti.max(c, d))
-    return top + fy * (bottom - top), gradient, lowest, highest
+    return top + fy * (bottom - top)
 
 
 @ti.func
@@ -66,6 +73,7 @@ def _extract_patches(
     pixels: ti.types.ndarray(ndim=2),  # out [P * size^2, 3]
     values: ti.types.ndarray(ndim=1),  # out [P * size^2]
 ):
+    ti.loop_config(serialize=True)  # a second core takes as long to wake up as this to run
     for m in range(values.shape[0]):
         patch, k = m // (size * size), m % (size * size)
         x = centres[patch, 0] + k % size - size // 2
@@ -108,100 +116,112 @@ def _sample_bilinear(
     for m in range(points.shape[0]):
         values[m], inside[m] = 0.0, ti.cast(0, ti.u8)
         if is_inside(points[m, 0], points[m, 1], image.shape[0], image.shape[1]):
-            value, _, _, _ = bilinear(image, points[m, 0], points[m, 1])
-            values[m], inside[m] = value, ti.cast(1, ti.u8)
+            values[m], inside[m] = bilinear(image, points[m, 0], points[m, 1]), ti.cast(1, ti.u8)
 
 
 @ti.func
 def huber(r, threshold):
-    """Huber weight and cost of a normalised residual."""
-    size = ti.abs(r)
-    weight, cost = 1.0, 0.5 * r * r
-    if size > threshold:
-        weight, cost = threshold / size, threshold * (size - 0.5 * threshold)
-    return weight, cost
+    """Huber weight and cost of normalised residuals."""
+    size = ti.max(r, 0.0 - r)
+    cut = ti.min(size, threshold)
+    return cut / ti.max(size, 1e-12), cut * (size - 0.5 * cut)
 
 
+@ti.func
+def interpolate(corner, u, v):
+    """Values and gradients at fractions (u, v) between corners a b / c d, and the corners' extremes."""
+    a, b, c, d = corner[0], corner[1], corner[2], corner[3]
+    top, bottom = a + u * (b - a), c + u * (d - c)
+    along_x = (b - a) + v * ((d - c) - (b - a))
+    lowest = ti.min(ti.min(a, b), ti.min(c, d))
+    highest = ti.max(ti.max(a, b), ti.max(c, d))
+    return top + v * (bottom - top), along_x, bottom - top, lowest, highest
+
+
+@vector_instructions
 @ti.kernel
-def _normal_equations(
+def _linearise(
     # inputs
-    pixels: ti.types.ndarray(ndim=2),  # [M, 3] patch pixels of view a
-    values: ti.types.ndarray(ndim=1),  # [M] their surface values
-    surface: ti.types.ndarray(ndim=2),  # [H, W] of view b
-    depth: ti.types.ndarray(ndim=2),  # [H, W] of view b, metres, 0 = missing
-    T_b_a: ti.types.ndarray(ndim=2),  # [4, 4]
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    max_depth_difference: float,  # tau_d, metres
-    surface_sigma: float,  # standard deviation of r_surface
-    depth_weight: float,  # weight of r_depth, 0 = surface only
-    depth_sigma: float,  # metres: standard deviation of depth is depth_sigma + depth_sigma_2 z^2
-    depth_sigma_2: float,  # per metre
-    huber_threshold: float,
+    points: lanes(2),  # [blocks, 4] X, Y, Z in view a (metres, Z = 0: none) and surface value
+    images: ti.types.ndarray(ndim=1),  # [V * H * W * 2] surface and depth (metres, 0 = missing) of all views
+    height: ti.i32,
+    width: ti.i32,
+    parts: ti.types.ndarray(ti.i32, ndim=2),  # [P, 4] first block, past the last, job, view
+    jobs: ti.types.ndarray(ndim=2),  # [J, JOB_SIZE]
+    num_workers: ti.i32,
     # outputs
-    sums: ti.types.ndarray(ndim=2),  # [PARTS, SUM_SIZE]
-    is_inverse: ti.template(),  # 1: the unknown updates T_a_b instead (reverse direction)
+    sums: ti.types.ndarray(ndim=2),  # [P, SUM_SIZE]
 ):
-    height, width = surface.shape[0], surface.shape[1]
-    n = pixels.shape[0]
-    for part in range(PARTS):
-        total = ti.Vector([0.0 for _ in range(SUM_SIZE)])
-        for m in range(n * part // PARTS, n * (part + 1) // PARTS):
-            if pixels[m, 2] > 0:
-                total[NUM_USABLE] += 1
-                z_a = 1.0 / pixels[m, 2]
-                p_a = ti.Vector([(pixels[m, 0] - cx) / fx * z_a, (pixels[m, 1] - cy) / fy * z_a, z_a])
-                p = transform(T_b_a, p_a)
-                inv_z = 1.0 / ti.max(p[2], NEAR)
-                x, y = fx * p[0] * inv_z + cx, fy * p[1] * inv_z + cy
-                if p[2] > NEAR and is_inside(x, y, height, width):
-                    value, gradient, _, _ = bilinear(surface, x, y)
-                    d, d_gradient, d_low, d_high = bilinear(depth, x, y)
+    for chunk in range(num_workers * CHUNK):
+        if chunk % CHUNK == 0:
+            w, num_parts = chunk // CHUNK, parts.shape[0]
+            for part in range(num_parts * w // num_workers, num_parts * (w + 1) // num_workers):
+                job, first_pixel = parts[part, 2], parts[part, 3] * height * width
+                T = [jobs[job, k] for k in range(12)]
+                fx, fy, cx, cy = jobs[job, FX], jobs[job, FY], jobs[job, CX], jobs[job, CY]
+                surface_scale = zeros() + 1.0 / jobs[job, SURFACE_SIGMA]
+                depth_weight = jobs[job, DEPTH_WEIGHT]
+                threshold = jobs[job, HUBER_THRESHOLD]
+                last_column, last_row = float(width - 1), float(height - 1)
+                total = [zeros() for _ in range(SUM_SIZE)]
+                for block in range(parts[part, 0], parts[part, 1]):
+                    X, Y, Z, value = points[block, 0], points[block, 1], points[block, 2], points[block, 3]
+                    p_x = T[0] * X + T[1] * Y + T[2] * Z + T[3]
+                    p_y = T[4] * X + T[5] * Y + T[6] * Z + T[7]
+                    p_z = T[8] * X + T[9] * Y + T[10] * Z + T[11]
+                    inv_z = 1.0 / ti.max(p_z, NEAR)
+                    x, y = fx * p_x * inv_z + cx, fy * p_y * inv_z + cy
+                    is_usable = Z > 0
+                    inside = is_usable & (p_z > NEAR)
+                    inside = inside & (x >= 0) & (x < last_column) & (y >= 0) & (y < last_row)
+                    x, y = ti.select(inside, x, 0.0), ti.select(inside, y, 0.0)
+                    column, row = ti.floor(x), ti.floor(y)
+                    surface_corners = [zeros() for _ in range(4)]
+                    depth_corners = [zeros() for _ in range(4)]
+                    for lane in ti.static(range(LANES)):
+                        pixel = ti.cast(row[lane], ti.i32) * width + ti.cast(column[lane], ti.i32)
+                        above = 2 * (first_pixel + pixel)
+                        place = [above, above + 2, above + 2 * width, above + 2 * width + 2]
+                        for k in ti.static(range(4)):
+                            surface_corners[k][lane] = images[place[k]]
+                            depth_corners[k][lane] = images[place[k] + 1]
+                    u, v = x - column, y - row
+                    s, s_x, s_y, _, _ = interpolate(surface_corners, u, v)
+                    d, d_x, d_y, d_low, d_high = interpolate(depth_corners, u, v)
                     has_depth = d_low > NEAR
-                    r_depth = p[2] - d
+                    r_depth = p_z - d
                     # tau_d: the depth check of Sec. III-B; without depth in b there is nothing to check.
-                    if not has_depth or ti.abs(r_depth) < max_depth_difference:
-                        # dx'/dp' and then dp'/dxi: [I | -[p']_x] forwards. Backwards, p' = T_b_a
-                        # exp(-xi) p_a, so dp'/dxi = -R_b_a [I | -[p_a]_x].
-                        du = ti.Vector([fx * inv_z, 0.0, -fx * p[0] * inv_z * inv_z])
-                        dv = ti.Vector([0.0, fy * inv_z, -fy * p[1] * inv_z * inv_z])
-                        along = gradient[0] * du + gradient[1] * dv
-                        along_depth = ti.Vector([0.0, 0.0, 1.0]) - d_gradient[0] * du - d_gradient[1] * dv
-                        s = p
-                        if ti.static(is_inverse == 1):
-                            R = ti.Matrix([[T_b_a[i, j] for j in range(3)] for i in range(3)])
-                            along, along_depth = -(R.transpose() @ along), -(R.transpose() @ along_depth)
-                            s = p_a
-                        turn = s.cross(along)  # row vector times -[s]_x
-                        J = ti.Vector([along[0], along[1], along[2], turn[0], turn[1], turn[2]])
-                        J /= surface_sigma
-                        r = (value - values[m]) / surface_sigma
-                        weight, cost = huber(r, huber_threshold)
-                        total[COST] += cost
-                        total[NUM_SURFACE] += 1
+                    disagreement = ti.select(has_depth, ti.max(r_depth, d - p_z), 0.0)
+                    keep = inside & (disagreement < jobs[job, MAX_DEPTH_DIFFERENCE])
+                    # A depth edge between the four corners says nothing about the surface.
+                    is_smooth = keep & has_depth & (d_high - d_low < 0.05 * d_high)
+                    depth_sigma = jobs[job, DEPTH_SIGMA] + jobs[job, DEPTH_SIGMA_2] * p_z * p_z
+                    # dx'/dp' = [fx / z, 0, -fx x / z^2], [0, fy / z, -fy y / z^2]; dp'/dxi = [I | -[p']_x]
+                    du, dv = fx * inv_z, fy * inv_z
+                    du_z, dv_z = du * p_x * inv_z, dv * p_y * inv_z
+                    for k in ti.static(range(2)):
+                        g_x, g_y, g_z, r = s_x * du, s_y * dv, 0.0 - s_x * du_z - s_y * dv_z, s - value
+                        scale, share, is_used, counted = surface_scale, 1.0, keep, 1.0
+                        if ti.static(k == 1):
+                            g_x, g_y, g_z = 0.0 - d_x * du, 0.0 - d_y * dv, 1.0 + d_x * du_z + d_y * dv_z
+                            r, scale, is_used = r_depth, 1.0 / depth_sigma, is_smooth
+                            share, counted = depth_weight, ti.select(depth_weight > 0, 1.0, 0.0)
+                        J = [
+                            g_x, g_y, g_z,
+                            p_y * g_z - p_z * g_y, p_z * g_x - p_x * g_z, p_x * g_y - p_y * g_x,
+                        ]  # fmt: skip
+                        weight, cost = huber(r * scale, threshold)
+                        total[COST] += ti.select(is_used, share * cost, 0.0)
+                        total[NUM_SURFACE + k] += ti.select(is_used, counted, 0.0)
+                        weight = ti.select(is_used, share * weight * scale * scale, 0.0)
                         for a in ti.static(range(6)):
-                            total[21 + a] += weight * J[a] * r
+                            weighted = weight * J[a]
+                            total[21 + a] += weighted * r
                             for b in ti.static(range(a, 6)):
-                                total[ti.static(a * 6 - a * (a - 1) // 2 + b - a)] += weight * J[a] * J[b]
-                        # A depth edge between the four corners says nothing about the surface.
-                        if has_depth and depth_weight > 0 and d_high - d_low < 0.05 * d_high:
-                            sigma = depth_sigma + depth_sigma_2 * p[2] * p[2]
-                            turn_depth = s.cross(along_depth)
-                            for a in ti.static(range(3)):
-                                J[a], J[a + 3] = along_depth[a] / sigma, turn_depth[a] / sigma
-                            r = r_depth / sigma
-                            weight, cost = huber(r, huber_threshold)
-                            weight *= depth_weight
-                            total[COST] += depth_weight * cost
-                            total[NUM_DEPTH] += 1
-                            for a in ti.static(range(6)):
-                                total[21 + a] += weight * J[a] * r
-                                for b in ti.static(range(a, 6)):
-                                    total[ti.static(a * 6 - a * (a - 1) // 2 + b - a)] += weight * J[a] * J[b]
-        for k in ti.static(range(SUM_SIZE)):
-            sums[part, k] = total[k]
+                                total[ti.static(a * 6 - a * (a - 1) // 2 + b - a)] += weighted * J[b]
+                    total[NUM_USABLE] += ti.select(is_usable, 1.0, 0.0)
+                for k in ti.static(range(SUM_SIZE)):
+                    sums[part, k] = total[k].sum()
 
 
 @dataclass(frozen=True)
@@ -210,6 +230,19 @@ class Patches:
 
     pixels: np.ndarray  # [M, 3] float: x, y, inverse depth in 1/m (0 = no depth: left out)
     values: np.ndarray  # [M] float: surface values
+
+    def points(self, intrinsics: tuple[float, float, float, float]) -> torch.Tensor:  # [blocks, 4, LANES]
+        """Return (X, Y, Z, value) in lanes: points in metres in the camera's frame, Z = 0 where unknown."""
+        fx, fy, cx, cy = intrinsics
+        x, y, rho = self.pixels.T
+        m = len(rho)
+        result = torch.zeros(-(-m // LANES), 4, LANES, dtype=float_dtype())
+        rows = np.zeros((4, len(result) * LANES), result.numpy().dtype)
+        np.divide(1, rho, out=rows[2, :m], where=rho > 0)
+        rows[0, :m], rows[1, :m] = (x - cx) / fx * rows[2, :m], (y - cy) / fy * rows[2, :m]
+        rows[3, :m] = self.values
+        result.numpy()[:] = rows.reshape(4, -1, LANES).swapaxes(0, 1)
+        return result
 
 
 @dataclass(frozen=True)
@@ -244,6 +277,10 @@ class NormalEquations:
             self.num_depth + other.num_depth,
             self.num_usable + other.num_usable,
         )
+
+    def transformed(self, A: np.ndarray) -> "NormalEquations":  # [6, 6]
+        """Return the system for another unknown xi', with xi = A xi'."""
+        return replace(self, H=A.T @ self.H @ A, g=A.T @ self.g)
 
 
 def extract_patches(
@@ -287,6 +324,67 @@ def sample_bilinear(
     return values, inside.astype(bool)
 
 
+@dataclass(frozen=True)
+class Direction:
+    """Patches of one view that are aligned to the image of another."""
+
+    points: torch.Tensor  # [blocks, 4, LANES], from `Patches.points`
+    view: int  # index of the image
+    model: ResidualModel
+
+
+class Alignment:
+    """Normal equations of several directions at once, for poses that change from call to call."""
+
+    def __init__(
+        self,
+        directions: list[Direction],
+        views: np.ndarray,  # [V, H, W, 2] surface and depth (metres, 0 = missing)
+        intrinsics: tuple[float, float, float, float],
+    ) -> None:
+        check_shape("views", views, (None, None, None, 2))
+        self._views = np.ascontiguousarray(views, _numpy_float())
+        self._points = torch.cat([direction.points for direction in directions])
+        self._jobs = np.empty((len(directions), JOB_SIZE), _numpy_float())
+        self._parts: list[slice] = []
+        bounds = []
+        begin = 0
+        for job, direction in enumerate(directions):
+            if not 0 <= direction.view < len(views):
+                raise ValueError(f"view: expected 0 to {len(views) - 1}, got {direction.view}")
+            past = begin + len(direction.points)
+            self._parts.append(slice(len(bounds), len(bounds) + -(-(past - begin) // PART)))
+            bounds += [(b, min(b + PART, past), job, direction.view) for b in range(begin, past, PART)]
+            begin = past
+            model = direction.model
+            self._jobs[job, FX:] = (
+                *intrinsics, model.max_depth_difference, model.surface_sigma,
+                model.depth_weight, model.depth_sigma, model.depth_sigma_2, model.huber_threshold,
+            )  # fmt: skip
+        self._bounds = np.array(bounds, np.int32).reshape(-1, 4)
+        self._sums = np.empty((len(bounds), SUM_SIZE), _numpy_float())
+
+    def linearise(self, poses: list[np.ndarray]) -> "list[NormalEquations]":  # T_b_a [4, 4] of each direction
+        """Return the Gauss-Newton system of Eq. 5 for each direction."""
+        for job, T_b_a in enumerate(poses):
+            self._jobs[job, :FX] = T_b_a[:3].ravel()
+        if len(self._bounds):
+            height, width = self._views.shape[1:3]
+            num_workers = min(workers(), 1 + len(self._bounds) // PARTS_PER_WORKER)
+            _linearise(
+                self._points, self._views.reshape(-1), height, width, self._bounds, self._jobs,
+                num_workers, self._sums,
+            )  # fmt: skip
+        totals = [self._sums[parts].sum(0, dtype=np.float64) for parts in self._parts]
+        return [
+            NormalEquations(
+                total[_SYMMETRIC], total[21:COST], float(total[COST]),
+                int(total[NUM_SURFACE]), int(total[NUM_DEPTH]), int(total[NUM_USABLE]),
+            )
+            for total in totals
+        ]  # fmt: skip
+
+
 def normal_equations(
     patches: Patches,  # of view a
     surface: np.ndarray,  # [H, W] of view b
@@ -302,16 +400,26 @@ def normal_equations(
     """
     check_shape("depth", depth, surface.shape)
     check_shape("T_b_a", T_b_a, (4, 4))
-    dtype = patches.pixels.dtype
-    sums = np.empty((PARTS, SUM_SIZE), dtype)
-    _normal_equations(
-        patches.pixels, patches.values, surface, depth, np.ascontiguousarray(T_b_a, dtype), *intrinsics,
-        model.max_depth_difference, model.surface_sigma, model.depth_weight, model.depth_sigma,
-        model.depth_sigma_2, model.huber_threshold, sums, int(inverse),
-    )  # fmt: skip
-    total = sums.sum(0, dtype=np.float64)
-    H = np.zeros((6, 6))
-    H[np.triu_indices(6)] = total[:21]
-    H = H + H.T - np.diag(np.diag(H))
-    counts = (int(total[k]) for k in (NUM_SURFACE, NUM_DEPTH, NUM_USABLE))
-    return NormalEquations(H, total[21:27].copy(), float(total[COST]), *counts)
+    direction = Direction(patches.points(intrinsics), 0, model)
+    (system,) = Alignment([direction], np.stack([surface, depth], -1)[None], intrinsics).linearise([T_b_a])
+    # T_b_a exp(-xi) = exp(-Ad(T_b_a) xi) T_b_a
+    return system.transformed(-adjoint(T_b_a)) if inverse else system
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]
+    """Return Ad(T) for twists (translation, rotation): T exp(xi) = exp(Ad(T) xi) T."""
+    R, (x, y, z) = T[:3, :3], T[:3, 3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    return result
+
+
+def _numpy_float() -> type:
+    return np.float64 if float_dtype() == torch.float64 else np.float32
+
+
+# Where the entries of H stand in a partial sum.
+_SYMMETRIC = np.array(
+    [[min(a, b) * 6 - min(a, b) * (min(a, b) - 1) // 2 + abs(a - b) for b in range(6)] for a in range(6)]
+)

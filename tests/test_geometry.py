@@ -5,10 +5,12 @@ import pytest
 import torch
 
 from edslam_ti.geometry import (
+    exp_matrix,
     from_rotation_translation,
     interpolate,
     inverse,
     orthonormalized,
+    rigid_inverse,
     rotation_angle_deg,
     se3_exp,
     se3_log,
@@ -143,3 +145,11 @@ def test_rotation_and_translation_make_a_matrix_of_any_batch_shape() -> None:
     T = from_rotation_translation(R, torch.ones(2, 5, 3))
     assert T.shape == (2, 5, 4, 4)
     assert T[1, 4].tolist() == [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_single_motions_agree_with_the_batched_ones(angle: float) -> None:
+    for twist in twists(angle, count=5):
+        T = se3_exp(twist)
+        np.testing.assert_allclose(exp_matrix(twist.numpy()), T.numpy(), atol=1e-15, rtol=1e-13)
+        np.testing.assert_allclose(rigid_inverse(T.numpy()), inverse(T).numpy(), atol=1e-15)

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+import kernels
 from edslam_ti.geometry import inverse, se3_exp
 from kernels import reference
 from kernels.patch_warp import (
+    Alignment,
+    Direction,
     ResidualModel,
+    adjoint,
     extract_patches,
     normal_equations,
     sample_bilinear,
@@ -125,3 +129,57 @@ def test_missing_depth_in_the_other_view_keeps_the_surface_residual() -> None:
     result = normal_equations(patches, surface, np.zeros_like(depth), np.eye(4), INTRINSICS, MODEL)
     assert result.num_depth == 0
     assert result.num_surface > 300
+
+
+def make_alignment(sizes: tuple[int, int]) -> Alignment:
+    """Patches of two views, each against the image of the other."""
+    views = [make_view(0), make_view(1)]
+    directions = [
+        Direction(extract_patches(*view, make_centres(n, 7), 5).points(INTRINSICS), 1 - k, MODEL)
+        for k, (view, n) in enumerate(zip(views, sizes))
+    ]
+    return Alignment(directions, np.stack([np.stack(view, -1) for view in views]), INTRINSICS)
+
+
+def test_directions_linearised_together_are_those_linearised_alone() -> None:
+    views, sizes, T = [make_view(0), make_view(1)], (30, 41), make_motion(0.02)
+    together = make_alignment(sizes).linearise([T, np.linalg.inv(T)])
+    for k, pose in enumerate((T, np.linalg.inv(T))):
+        patches = extract_patches(*views[k], make_centres(sizes[k], 7), 5)
+        alone = normal_equations(patches, *views[1 - k], pose, INTRINSICS, MODEL)
+        assert np.array_equal(together[k].H, alone.H)
+        assert np.array_equal(together[k].g, alone.g)
+        assert (together[k].cost, together[k].num_usable) == (alone.cost, alone.num_usable)
+
+
+def test_normal_equations_have_the_same_bits_for_any_number_of_threads() -> None:
+    T = make_motion(0.02)
+    systems = []
+    for threads in (1, 3, 2):
+        kernels.init("cpu", threads=threads)
+        systems.append(make_alignment((900, 300)).linearise([T, np.linalg.inv(T)]))
+    for others in systems[1:]:
+        for ours, other in zip(systems[0], others):
+            assert np.array_equal(ours.H, other.H)
+            assert np.array_equal(ours.g, other.g)
+
+
+def test_patches_without_a_pixel_give_an_empty_system() -> None:
+    (system,) = make_alignment((0, 0)).linearise([np.eye(4)] * 2)[:1]
+    assert (system.num_usable, system.cost) == (0, 0)
+    assert not system.H.any()
+
+
+def test_view_that_is_not_there_is_refused() -> None:
+    surface, depth = make_view(0)
+    points = extract_patches(surface, depth, make_centres(3, 0), 5).points(INTRINSICS)
+    with pytest.raises(ValueError, match="view: expected 0 to 0, got 1"):
+        Alignment([Direction(points, 1, MODEL)], np.stack([surface, depth], -1)[None], INTRINSICS)
+
+
+def test_adjoint_carries_a_twist_to_the_other_side() -> None:
+    generator = torch.Generator().manual_seed(0)
+    T = se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))
+    twist = torch.randn(6, generator=generator, dtype=torch.float64)
+    moved = se3_exp(torch.from_numpy(adjoint(T.numpy())) @ twist)
+    np.testing.assert_allclose((moved @ T).numpy(), (T @ se3_exp(twist)).numpy(), atol=1e-12)

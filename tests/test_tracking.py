@@ -4,17 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from sequences import ate_cm, position_errors, settings, tracked, without_depth, without_events
 
-import edslam_ti.tracking
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, Sample
-from edslam_ti.geometry import se3_exp
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import TruePoses, adjoint
+from edslam_ti.tracking import TruePoses
 from edslam_ti.trajectory import Trajectory
-from kernels.patch_warp import NormalEquations, normal_equations
+from kernels.patch_warp import Alignment, NormalEquations
 
 PAPER = settings("ed_slam_paper")
 
@@ -134,24 +131,17 @@ def test_only_the_combined_objective_has_depth_residuals(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     counts = []
+    linearise = Alignment.linearise
 
-    def counting(*arguments: object, **options: object) -> NormalEquations:
-        system = normal_equations(*arguments, **options)  # type: ignore[arg-type]
-        counts.append(system.num_depth)
-        return system
+    def counting(self: Alignment, poses: list[np.ndarray]) -> list[NormalEquations]:
+        systems = linearise(self, poses)
+        counts.extend(system.num_depth for system in systems)
+        return systems
 
-    monkeypatch.setattr(edslam_ti.tracking, "normal_equations", counting)
+    monkeypatch.setattr(Alignment, "linearise", counting)
     tracked(tiny_sequence, tiny_samples[:3], config)
     assert len(counts) > 2
     assert any(counts) == uses_depth
-
-
-def test_adjoint_carries_a_twist_to_the_other_side() -> None:
-    generator = torch.Generator().manual_seed(0)
-    T = se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))
-    twist = torch.randn(6, generator=generator, dtype=torch.float64)
-    moved = se3_exp(torch.from_numpy(adjoint(T.numpy())) @ twist)
-    np.testing.assert_allclose((moved @ T).numpy(), (T @ se3_exp(twist)).numpy(), atol=1e-12)
 
 
 def test_true_poses_are_the_truth_and_lost_where_there_is_none(
