@@ -17,6 +17,7 @@ from kernels.patch_warp import (
     NormalEquations,
     ResidualModel,
     adjoint,
+    compile_kernels,
     extract_patches,
 )
 
@@ -114,6 +115,7 @@ class BidirectionalPatchTracker:
             huber_threshold=config.huber_threshold,
         )
         self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
+        compile_kernels()
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame` relative to the references' poses on the trajectory."""

@@ -68,6 +68,8 @@ class Trajectory:
         k = bisect.bisect_right(self._timestamps, timestamp) - 1
         k = min(max(k, 0), len(self._poses) - 2)
         start, end = self._timestamps[k], self._timestamps[k + 1]
+        if timestamp == start:
+            return self._poses[k].copy()
         pose = interpolate(
             torch.from_numpy(self._poses[k]),
             torch.from_numpy(self._poses[k + 1]),

@@ -236,7 +236,7 @@ class Patches:
         fx, fy, cx, cy = intrinsics
         x, y, rho = self.pixels.T
         m = len(rho)
-        result = torch.zeros(-(-m // LANES), 4, LANES, dtype=float_dtype())
+        result = torch.empty(-(-m // LANES), 4, LANES, dtype=float_dtype())
         rows = np.zeros((4, len(result) * LANES), result.numpy().dtype)
         np.divide(1, rho, out=rows[2, :m], where=rho > 0)
         rows[0, :m], rows[1, :m] = (x - cx) / fx * rows[2, :m], (y - cy) / fy * rows[2, :m]
@@ -344,7 +344,9 @@ class Alignment:
     ) -> None:
         check_shape("views", views, (None, None, None, 2))
         self._views = np.ascontiguousarray(views, _numpy_float())
-        self._points = torch.cat([direction.points for direction in directions])
+        points = [direction.points.numpy() for direction in directions]
+        self._points = torch.empty(sum(map(len, points)), 4, LANES, dtype=float_dtype())
+        np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
         self._jobs = np.empty((len(directions), JOB_SIZE), _numpy_float())
         self._parts: list[slice] = []
         bounds = []
@@ -404,6 +406,13 @@ def normal_equations(
     (system,) = Alignment([direction], np.stack([surface, depth], -1)[None], intrinsics).linearise([T_b_a])
     # T_b_a exp(-xi) = exp(-Ad(T_b_a) xi) T_b_a
     return system.transformed(-adjoint(T_b_a)) if inverse else system
+
+
+def compile_kernels() -> None:
+    """Compile what tracking needs, so that the first frames of a sequence need not wait for it."""
+    image = np.ones((2, 2), _numpy_float())
+    patches = extract_patches(image, image, np.zeros((1, 2), np.int32), 1)
+    normal_equations(patches, image, image, np.eye(4), (1.0, 1.0, 0.0, 0.0), ResidualModel())
 
 
 def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]

@@ -1,6 +1,8 @@
 """Start Taichi, and check what crosses the torch / Taichi boundary."""
 
+import ast
 import contextlib
+import functools
 import io
 import os
 
@@ -8,9 +10,24 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 import numpy as np
 import taichi as ti
+import taichi.lang.matrix_ops  # Taichi's first vector would import it, eight times as slowly by then
 import torch
+from taichi.lang import kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 CHUNK = 512  # Taichi's CPU backend never splits a loop into pieces smaller than this
+
+
+def _place_in_source(self: ASTTransformerContext, node: ast.expr | ast.stmt) -> str:
+    """Say where in our source a kernel does not compile."""
+    line = node.lineno + self.lineno_offset
+    return f'File "{self.file}", line {line}, in {self.func.func.__name__}:\n{self.src[node.lineno - 1]}\n'
+
+
+# Until a kernel first runs, Taichi spent more than half the time on wording this for every expression, and on
+# finding the source of functions once for each of their uses.
+ASTTransformerContext.get_pos_info = _place_in_source
+kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
 
 
 def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool = False) -> None:
