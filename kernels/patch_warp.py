@@ -410,7 +410,7 @@ def normal_equations(
 
 def compile_kernels() -> None:
     """Compile what tracking needs, so that the first frames of a sequence need not wait for it."""
-    image = np.ones((2, 2), _numpy_float())
+    image = np.zeros((2, 2), _numpy_float())
     patches = extract_patches(image, image, np.zeros((1, 2), np.int32), 1)
     normal_equations(patches, image, image, np.eye(4), (1.0, 1.0, 0.0, 0.0), ResidualModel())
 
