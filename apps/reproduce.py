@@ -6,7 +6,7 @@ kept too, so a run that was stopped goes on where it ended. Tables and pictures 
 
     python apps/reproduce.py tracking --quick true                        four short cases, about 3 minutes
     python apps/reproduce.py tracking --scenes wall --seeds 0             one scene
-    python apps/reproduce.py tracking --methods ed_slam open3d_rgbd
+    python apps/reproduce.py tracking --methods ed_slam open3d_icp
 """
 
 import sys
@@ -23,7 +23,7 @@ from edslam_ti.reproduce.cases import EVERYTHING, Selection, all_cases, quick_ca
 
 def tracking(
     select: Annotated[Selection, tyro.conf.arg(name="")] = EVERYTHING,
-    methods: tuple[str, ...] = ("ed_slam", "ed_slam_paper", "open3d_rgbd"),
+    methods: tuple[str, ...] = ("ed_slam", "ed_slam_paper", "open3d_icp", "open3d_rgbd"),
     out: Path = Path("results/reproduce"),
     data_dir: Path = Path("../shared/data"),
     quick: bool = False,

@@ -159,7 +159,7 @@ class Config(Stage):
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
     method: str = "ed_slam"
-    """What runs: ed_slam, ed_slam_paper (Eq. 5 to the letter), open3d_rgbd."""
+    """What runs: ed_slam, ed_slam_paper (Eq. 5 to the letter), open3d_rgbd, open3d_icp, kiss_icp."""
     start: float = Field(0.0, ge=0)
     """Seconds of the sequence to skip."""
     duration: float | None = Field(None, gt=0)

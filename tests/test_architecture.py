@@ -50,6 +50,7 @@ LIBRARIES: dict[str, list[str]] = {
     "platformdirs": ["edslam_ti.datasets.*"],
     "evo": ["edslam_ti.evaluation"],
     "skimage": ["edslam_ti.evaluation"],
+    "kiss_icp": ["edslam_ti.baselines.*"],
     "lpips": ["edslam_ti.evaluation"],
     "matplotlib": ["edslam_ti.visualization"],
     "rich": [
@@ -182,7 +183,7 @@ def test_apps_are_thin(module: str) -> None:
 
 
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
-HEAVY = {"open3d", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
+HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m != "edslam_ti.open3d_loader"])

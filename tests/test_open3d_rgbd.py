@@ -1,5 +1,7 @@
 """The baseline of Open3D's odometry and TSDF volume, on an exact scene and on real Kinect frames."""
 
+import importlib.util
+import sys
 from pathlib import Path
 
 import cv2
@@ -7,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from edslam_ti.baselines.open3d_rgbd import RgbdOdometryTracker, TsdfMapper
+from edslam_ti.baselines.kiss import KissIcpTracker
+from edslam_ti.baselines.open3d_rgbd import OdometryTracker, RgbdOdometryTracker, TsdfMapper
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.errors import DataError
@@ -136,6 +139,35 @@ def test_frame_that_shows_nothing_is_lost_at_the_guess() -> None:
     assert not result.converged
     assert result.quality == 0
     np.testing.assert_allclose(result.T_world_camera, guess, atol=1e-12)
+
+
+def test_depth_alone_is_followed_without_images() -> None:
+    truth = straight_path(12)
+    tracker, trajectory = OdometryTracker(CAMERA, "PointToPlane"), Trajectory()
+    for k, T in enumerate(truth):
+        now = frame(0.05 * k, corner_view(T)[0], None)
+        result = tracker.track(now, trajectory.at(now.timestamp) if k else truth[0], trajectory)
+        assert result.converged, (k, result.message)
+        trajectory.append(now.timestamp, result.T_world_camera)
+    error = np.linalg.norm(trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert error.max() < 0.003  # of 17 cm
+    lost = tracker.track(frame(0.6, None, None), truth[3], trajectory)
+    assert not lost.converged
+    np.testing.assert_array_equal(lost.T_world_camera, truth[3])
+
+
+def test_kiss_icp_follows_depth_or_says_that_it_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    if importlib.util.find_spec("kiss_icp") is not None:
+        truth = straight_path(6)
+        tracker, trajectory = KissIcpTracker(CAMERA), Trajectory()
+        for k, T in enumerate(truth):
+            result = tracker.track(frame(0.05 * k, corner_view(T)[0], None), truth[0], trajectory)
+            trajectory.append(0.05 * k, result.T_world_camera)
+        # Points on three bare walls slide along them: 4 cm of 8.5 cm, where one pixel is 1 to 2 cm.
+        assert np.linalg.norm(trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.05
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    with pytest.raises(ModuleNotFoundError, match="not installed: method kiss_icp needs pip install"):
+        KissIcpTracker(CAMERA)
 
 
 def test_held_out_frames_are_not_fused() -> None:

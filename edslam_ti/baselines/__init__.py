@@ -40,6 +40,23 @@ def _open3d_rgbd(
     return RgbdOdometryTracker(sequence), TsdfMapper(sequence.camera)
 
 
+def _open3d_icp(
+    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.open3d_rgbd import OdometryTracker, TsdfMapper
+
+    return OdometryTracker(sequence.camera, "PointToPlane"), TsdfMapper(sequence.camera)
+
+
+def _kiss_icp(
+    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.kiss import KissIcpTracker
+    from edslam_ti.baselines.open3d_rgbd import TsdfMapper
+
+    return KissIcpTracker(sequence.camera), TsdfMapper(sequence.camera)
+
+
 METHODS: dict[str, Method] = {
     "ed_slam": Method(
         "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
@@ -51,5 +68,11 @@ METHODS: dict[str, Method] = {
     ),
     "open3d_rgbd": Method(
         "Open3D's RGB-D odometry and TSDF volume; needs images, uses no events", _open3d_rgbd
+    ),
+    "open3d_icp": Method(
+        "Open3D's point-to-plane odometry of depth alone and TSDF volume; uses no events", _open3d_icp
+    ),
+    "kiss_icp": Method(
+        "KISS-ICP (where installed) on points of the depth images, TSDF volume; uses no events", _kiss_icp
     ),
 }

@@ -2,8 +2,9 @@
 
 Re-implemented here from a library, not an author's system: hybrid photometric and geometric alignment
 (Park et al. 2017) to a reference frame, and volumetric fusion (Curless and Levoy 1996). It uses no
-events but looks at images, which an event camera may not have. Open3D adds up in parallel: two runs
-agree to about a micrometre, not to the last digit.
+events but looks at images, which an event camera may not have. Method `open3d_icp` is the same with depth
+alone: point-to-plane alignment with projective association (Newcombe et al. 2011). Open3D adds up in
+parallel: two runs agree to about a micrometre, not to the last digit.
 """
 
 from typing import Any
@@ -32,30 +33,25 @@ REFERENCE_DISTANCE = 0.1  # metres
 REFERENCE_ANGLE = 6.0  # degrees
 
 
-class RgbdOdometryTracker:
-    """Aligns each RGB-D frame to a reference frame (Tracker)."""
+class OdometryTracker:
+    """Aligns each frame to a reference frame by an Open3D odometry `method` (Tracker)."""
 
-    def __init__(self, sequence: EventDepthSequence) -> None:
-        """Check that the sequence has images where it has depth."""
-        depth_times, image_times = sequence.depth_timestamps, sequence.image_timestamps
-        gaps = np.abs(depth_times[:, None] - image_times[None]).min(1, initial=np.inf)  # [D] seconds
-        if np.count_nonzero(gaps <= 1e-3) < 2:
-            raise DataError(
-                f"{sequence.scene}: method open3d_rgbd needs images taken with the depth images, got "
-                f"{len(image_times)} images and {len(depth_times)} depth images, fewer than 2 of them "
-                "within 1 ms of each other; use --method ed_slam"
-            )
-        self._intrinsics = load_open3d().core.Tensor(sequence.camera.matrix)
+    def __init__(self, camera: Camera, method: str) -> None:
+        """`method`: Hybrid (brightness and depth) or PointToPlane (depth alone, no image needed)."""
+        self._intrinsics = load_open3d().core.Tensor(camera.matrix)
+        self._method = method
         self._reference: tuple[Any, np.ndarray] | None = None  # RGB-D image, T_world_camera
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; without depth or image it is the guess, and said to be lost."""
-        if frame.depth is None or frame.image is None:
+        """Return the pose of `frame`; without its data it is the guess, and said to be lost."""
+        needs_image = self._method != "PointToPlane"
+        if frame.depth is None or (needs_image and frame.image is None):
             missing = "depth image" if frame.depth is None else "image"
             return TrackingResult(
                 T_world_camera_guess, False, 0.0, f"no {missing} at this time: pose predicted"
             )
-        current = _rgbd_image(frame.depth, frame.image)
+        image = frame.image if needs_image and frame.image is not None else np.zeros_like(frame.depth)
+        current = _rgbd_image(frame.depth, image)
         if self._reference is None:
             self._reference = current, T_world_camera_guess
             return TrackingResult(T_world_camera_guess, True, 1.0)
@@ -87,11 +83,27 @@ class RgbdOdometryTracker:
                 depth_scale=1.0,
                 depth_max=MAX_DEPTH,
                 criteria_list=[odometry.OdometryConvergenceCriteria(n) for n in ITERATIONS],
-                method=odometry.Method.Hybrid,
+                method=getattr(odometry.Method, self._method),
             )
         except RuntimeError:  # Open3D's answer to a singular system: nothing to align
             return T_guess, 0.0
         return result.transformation.numpy(), float(result.fitness)
+
+
+class RgbdOdometryTracker(OdometryTracker):
+    """Aligns brightness and depth together."""
+
+    def __init__(self, sequence: EventDepthSequence) -> None:
+        """Check that the sequence has images where it has depth."""
+        depth_times, image_times = sequence.depth_timestamps, sequence.image_timestamps
+        gaps = np.abs(depth_times[:, None] - image_times[None]).min(1, initial=np.inf)  # [D] seconds
+        if np.count_nonzero(gaps <= 1e-3) < 2:
+            raise DataError(
+                f"{sequence.scene}: method open3d_rgbd needs images taken with the depth images, got "
+                f"{len(image_times)} images and {len(depth_times)} depth images, fewer than 2 of them "
+                "within 1 ms of each other; use --method ed_slam"
+            )
+        super().__init__(sequence.camera, "Hybrid")
 
 
 class TsdfMapper:
