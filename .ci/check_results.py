@@ -6,12 +6,13 @@ from pathlib import Path
 
 FILES = [
     *("trajectory_tum.txt", "trajectory.png", "map.ply", "mesh.ply", "points.ply"),
-    *("config.yaml", "metrics.json", "log.txt"),
+    *("config.yaml", "metrics.json", "log.txt", "flythrough.mp4", "renders/contact.png", "renders/views.csv"),
 ]
 KEYS = [
     *("dataset", "scene", "method", "protocol", "device"),
     *("ate_rmse_cm", "ate_mean_cm", "ate_rmse_sim3_cm", "rpe_trans_cm", "rpe_rot_deg"),
     *("psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "depth_l1_cm"),
+    *("psnr_novel_corrected_db", "mesh_accuracy_cm", "mesh_completion_ratio_5cm", "ate_frontend_rmse_cm"),
     *("num_frames", "num_lost_frames", "num_gaussians", "num_events"),
     *("tracking_hz", "total_fps", "wall_s", "peak_memory_mb"),
 ]

@@ -144,7 +144,9 @@ class EvaluationConfig(Stage):
     hold_out_every: int = Field(5, ge=2)
     """Every n-th frame is held out: its depth and its exact time stamp are never used for mapping."""
     max_images: int = Field(20, ge=1)
-    """At most this many held-out views are rendered and compared."""
+    """At most this many views of each kind (held out, mapped, beside the path) are rendered and compared."""
+    flythrough_frames: int = Field(100, ge=1)
+    """At most this many frames of `flythrough.mp4`, 15 a second."""
     lpips_weights: Path | None = None
     """LPIPS weights (AlexNet backbone and linear heads in one torch state dict)."""
 

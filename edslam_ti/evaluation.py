@@ -4,7 +4,7 @@ Peers call different things ATE and PSNR, so every variant has a name of its own
 rmse, mean, median or maximum; raw images or EventNeRF's linear fit; pixels with true depth, or all.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -33,6 +33,8 @@ class TrajectoryErrors:
     """
 
     timestamps: np.ndarray  # [P] s, the poses compared
+    indices: np.ndarray  # [P] of the poses compared in the estimate
+    T_truth_estimate: np.ndarray  # [4, 4] SE(3) alignment
     aligned_positions: np.ndarray  # [P, 3] m, estimate in the truth's frame, SE(3)
     true_positions: np.ndarray  # [P, 3] m
     errors_cm: np.ndarray  # [P] SE(3)
@@ -91,9 +93,11 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
     estimated = np.array([orthonormalized(T) for T in estimate.poses[common]])
     true = truth.resampled(timestamps).poses
     reference = PosePath3D(poses_se3=list(true))
-    aligned, errors = [], []
+    aligned, errors, rigid = [], [], np.eye(4)
     for with_scale in (False, True):
         R, t, scale = align(estimated, true, with_scale)
+        if not with_scale:
+            rigid[:3, :3], rigid[:3, 3] = R, t
         moved = np.tile(np.eye(4), (len(estimated), 1, 1))
         moved[:, :3, :3] = R @ estimated[:, :3, :3]
         moved[:, :3, 3] = scale * estimated[:, :3, 3] @ R.T + t
@@ -108,6 +112,8 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
         motion[relation] = np.asarray(rpe.error)
     return TrajectoryErrors(
         timestamps=timestamps,
+        indices=np.flatnonzero(common),
+        T_truth_estimate=rigid,
         aligned_positions=aligned[0],
         true_positions=true[:, :3, 3],
         errors_cm=errors[0],
@@ -148,6 +154,27 @@ def align(
     return R, q.mean(0) - scale * R @ p.mean(0), scale
 
 
+def align_views(
+    estimated: np.ndarray,  # [P, 4, 4]
+    true: np.ndarray,  # [P, 4, 4]
+    distance: float = 1.0,  # metres to what the cameras see
+) -> np.ndarray:  # [4, 4]
+    """Return the rigid motion from the estimate's frame to the truth's under which the cameras see alike.
+
+    Positions alone leave the rotation loose where the path is short: 1 mm over 10 cm is half a degree,
+    two pixels. Here the points `distance` metres along the axes of every camera are brought together, too:
+    Procrustes with the orientations added to the covariance of the positions.
+    """
+    p, q = estimated[:, :3, 3], true[:, :3, 3]
+    covariance = (q - q.mean(0)).T @ (p - p.mean(0))
+    covariance += distance**2 * np.einsum("nij,nkj->ik", true[:, :3, :3], estimated[:, :3, :3])
+    U, _, Vt = np.linalg.svd(covariance)
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[:3, 3] = q.mean(0) - T[:3, :3] @ p.mean(0)
+    return T
+
+
 def statistics(errors: np.ndarray) -> dict[str, float]:
     """Return the seven numbers that evo prints, in its order."""
     return {
@@ -180,6 +207,30 @@ def _span(trajectory: Trajectory) -> str:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).mean()))
+
+
+# Slices of EventReplica's scenes that IncEventGS evaluates on, as (first, end) of every second written pose
+# (configs/SimuEvent/replica_*.yaml of WU-CVGL/IncEventGS at 28d070f).
+INCEVENTGS_SLICES = {
+    "office0": (10, 60),
+    "office2": (350, 400),
+    "office3": (100, 150),
+    "room0": (90, 140),
+    "room2": (20, 70),
+}
+
+
+def inceventgs_slice(
+    scene: str, truth: Trajectory, estimate: Trajectory
+) -> tuple[float, float] | None:  # seconds
+    """Return IncEventGS's slice of one of EventReplica's scenes; None: the estimate does not cover it."""
+    first, end = (2 * k for k in INCEVENTGS_SLICES.get(scene, (0, 0)))
+    if end == 0 or end >= len(truth):
+        return None
+    start, stop = float(truth.timestamps[first]), float(truth.timestamps[end])
+    tolerance = 0.1  # seconds; the first sample comes a little after the first event
+    covered = estimate.timestamps[0] <= start + tolerance and estimate.timestamps[-1] >= stop - tolerance
+    return (start, stop) if covered else None
 
 
 # --- images ---
@@ -296,8 +347,7 @@ class Lpips:
         """Return the distance of two images [H, W] or [H, W, 3] (RGB) in [0, 1], at least 32x32 pixels."""
         distance = 0.0
         for linear, f, g in zip(self._linear, self._features(a), self._features(b)):
-            difference = (_unit_length(f) - _unit_length(g)) ** 2  # [1, C, h, w]
-            distance += float(F.conv2d(difference, linear).mean())
+            distance += float(F.conv2d((f - g) ** 2, linear).mean())
         return distance
 
     def _features(self, image: np.ndarray) -> list[Tensor]:
@@ -307,7 +357,7 @@ class Lpips:
             if pool:
                 x = F.max_pool2d(x, 3, 2)
             x = F.relu(F.conv2d(x, weight, bias, stride, padding))
-            features.append(x)
+            features.append(_unit_length(x))
         return features
 
 
@@ -350,6 +400,15 @@ def load_lpips(weights: Path | None) -> "Lpips | _PackageLpips | None":
 
 
 @dataclass(frozen=True)
+class ViewMetrics:
+    """One view of a set, over its pixels with true depth (all pixels where the set has none)."""
+
+    psnr_corrected_db: float | None  # None: the view has no such pixel
+    ssim_corrected: float | None
+    lpips_corrected: float | None
+
+
+@dataclass(frozen=True)
 class ImageMetrics:
     """Metrics of a set of views: over pixels with true depth (the headline), and over all pixels.
 
@@ -358,6 +417,8 @@ class ImageMetrics:
     """
 
     num_views: int
+    fit: LinearFit  # over pixels with true depth (all pixels where there are none)
+    views: list[ViewMetrics]
     psnr_db: float | None
     psnr_corrected_db: float | None
     ssim_corrected: float | None
@@ -366,6 +427,8 @@ class ImageMetrics:
     psnr_corrected_db_all: float
     ssim_corrected_all: float
     lpips_corrected_all: float | None
+    ssim_all: float
+    lpips_all: float | None
 
 
 def evaluate_images(
@@ -389,23 +452,48 @@ def evaluate_images(
     nowhere = [np.zeros(t.shape[:2], bool) for t in truths]
     masks = [n if m is None else np.asarray(m, bool) for m, n in zip(depth_masks, nowhere)]
     distance = load_lpips(lpips_weights)
+    whole_fit = fit_event_nerf(predictions, truths, everywhere)
+    whole = [whole_fit(p) for p in predictions]
+    over_all = [_view_metrics(c, t, m, distance) for c, t, m in zip(whole, truths, everywhere)]
+    has_depth = any(m.any() for m in masks)
+    fit = fit_event_nerf(predictions, truths, masks) if has_depth else whole_fit
+    corrected = [fit(p) for p in predictions]
+    views = over_all
+    if has_depth and not all(m.all() for m in masks):
+        views = [_view_metrics(c, t, m, distance) for c, t, m in zip(corrected, truths, masks)]
+    return ImageMetrics(
+        num_views=len(predictions),
+        fit=fit,
+        views=views,
+        psnr_db=psnr(predictions, truths, masks) if has_depth else None,
+        psnr_corrected_db=psnr(corrected, truths, masks) if has_depth else None,
+        ssim_corrected=_mean(v.ssim_corrected for v in views) if has_depth else None,
+        lpips_corrected=_mean(v.lpips_corrected for v in views) if has_depth else None,
+        psnr_db_all=psnr(predictions, truths, everywhere),
+        psnr_corrected_db_all=psnr(whole, truths, everywhere),
+        ssim_corrected_all=float(np.mean([v.ssim_corrected for v in over_all])),
+        lpips_corrected_all=_mean(v.lpips_corrected for v in over_all),
+        ssim_all=ssim(predictions, truths, everywhere),
+        lpips_all=_mean(distance(p, t) for p, t in zip(predictions, truths)) if distance else None,
+    )
 
-    def measure(counted: Masks) -> tuple[float | None, ...]:
-        """Return PSNR, corrected PSNR, SSIM, LPIPS."""
-        if not any(m.any() for m in counted):
-            return None, None, None, None
-        fit = fit_event_nerf(predictions, truths, counted)
-        corrected = [fit(p) for p in predictions]
-        perceptual = None
-        if distance is not None:
-            filled = [_filled(c, t, m) for c, t, m in zip(corrected, truths, counted)]
-            pairs = [(f, t) for f, t, m in zip(filled, truths, counted) if m.any()]
-            perceptual = float(np.mean([distance(f, t) for f, t in pairs]))
-        raw_psnr = psnr(predictions, truths, counted)
-        return raw_psnr, psnr(corrected, truths, counted), ssim(corrected, truths, counted), perceptual
 
-    with_depth, over_all = measure(masks), measure(everywhere)
-    return ImageMetrics(len(predictions), *with_depth, *over_all)  # type: ignore[arg-type]
+def _view_metrics(
+    corrected: np.ndarray, truth: np.ndarray, mask: np.ndarray, distance: "Lpips | _PackageLpips | None"
+) -> ViewMetrics:
+    if not mask.any():
+        return ViewMetrics(None, None, None)
+    return ViewMetrics(
+        psnr([corrected], [truth], [mask]),
+        ssim([corrected], [truth], [mask]),
+        distance(_filled(corrected, truth, mask), truth) if distance else None,
+    )
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Return the mean of what there is."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _filled(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> np.ndarray:

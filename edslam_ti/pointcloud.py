@@ -1,4 +1,4 @@
-"""Depth images to points, and the spacing of points that gives Gaussians their first scales (Open3D)."""
+"""Depth images to points (Open3D)."""
 
 import numpy as np
 
@@ -7,7 +7,6 @@ from edslam_ti.errors import DataError
 from edslam_ti.open3d_loader import load_open3d
 
 FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
-SMALLEST_SCALE = 1e-4  # metres; points that coincide would give a scale of zero, whose logarithm is -inf
 
 
 def depth_to_points(
@@ -37,29 +36,6 @@ def depth_to_points(
     points = np.asarray(cloud.points, dtype=np.float32).reshape(-1, 3)
     y, x = np.nonzero(used)
     return points, np.stack([x, y], -1)
-
-
-def nearest_neighbour_scales(
-    points: np.ndarray,  # [N, 3] metres, N >= 2
-    max_neighbours: int = 3,
-) -> np.ndarray:  # [N] float32 metres
-    """Return the mean distance of each point to its nearest others (Kerbl et al. 2023, Sec. 5.1)."""
-    if len(points) < 2:
-        raise DataError(
-            f"points: expected at least 2 to measure their spacing, got {len(points)}; "
-            "use the size of a pixel at that depth instead"
-        )
-    o3d = load_open3d()
-    search = o3d.core.nns.NearestNeighborSearch(
-        o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
-    )
-    search.knn_index()
-    count = min(max_neighbours + 1, len(points))  # the nearest is the point itself
-    _, squared = search.knn_search(
-        o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)), count
-    )  # [N, count]
-    distances = np.sqrt(np.maximum(squared.numpy()[:, 1:], 0))
-    return np.maximum(distances.mean(1), SMALLEST_SCALE)
 
 
 def _check_image(name: str, image: np.ndarray, camera: Camera) -> None:

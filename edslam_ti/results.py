@@ -1,5 +1,6 @@
 """The results folder of a run: trajectory, map, pictures and numbers, written whole or not at all."""
 
+import csv
 import json
 import os
 import platform
@@ -19,17 +20,40 @@ from edslam_ti import __version__
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation import depth_l1_cm, evaluate_images, fit_event_nerf, psnr, trajectory_errors
+from edslam_ti.evaluation import (
+    ImageMetrics,
+    LinearFit,
+    ViewMetrics,
+    align_views,
+    depth_l1_cm,
+    evaluate_images,
+    inceventgs_slice,
+    trajectory_errors,
+)
 from edslam_ti.export import fuse_mesh, write_gaussian_ply, write_mesh, write_points
+from edslam_ti.geometry import orthonormalized, rotation_angle_deg
 from edslam_ti.mapping import GaussianMapper, Mapper
-from edslam_ti.output import atomic_folder
+from edslam_ti.output import atomic_file, atomic_folder
+from edslam_ti.pictures import (
+    NoEncoderError,
+    PictureRow,
+    fly_through_frames,
+    smooth_path,
+    write_contact_sheet,
+    write_video,
+)
 from edslam_ti.rendering import View
 from edslam_ti.slam import Slam
+from edslam_ti.surface_errors import TrueSurfaces
 from edslam_ti.trajectory import Trajectory, write_tum
-from edslam_ti.visualization import plot_trajectory, write_render_triptychs
+from edslam_ti.visualization import plot_trajectory
+from edslam_ti.volume import without_depth_edges
 
-MESH_VIEWS = 40  # rendered depth images fused into the mesh
 MESH_VOXEL = 0.02  # metres
+MESH_ALPHA = 0.9  # pixels less opaque are left out of the mesh
+MESH_STEP, MESH_TURN = 0.1, 5.0  # metres, degrees between the views that are fused
+CONTACT_ROWS = {"held out": 6, "mapped": 0, "novel": 6}  # of the contact sheet
+VIDEO_FPS = 15.0
 
 
 @dataclass
@@ -65,9 +89,15 @@ def save(state: Run, console: Console) -> Path:
         if truth is not None:
             write_tum(truth, partial / "truth_tum.txt")
         (partial / "config.yaml").write_text(config.to_yaml())
-        metrics = _metrics(state, partial)
-        if state.slam.mapper is not None:
-            _write_map(state, state.slam.mapper, partial)
+        mapper, mesh, fit = state.slam.mapper, None, None
+        images, fit = _view_metrics(state, partial)
+        if mapper is not None:
+            if len(mapper.points()[0]):
+                mesh = _write_map(state, mapper, partial)
+                _write_fly_through(state, mapper, fit, partial / "flythrough.mp4")
+            else:
+                state.note("the map is empty: no map.ply, points.ply, mesh.ply, flythrough.mp4")
+        metrics = _metrics(state, images | _mesh_metrics(state, mesh))
         plot_trajectory(partial / "trajectory.png", {config.method: state.slam.trajectory}, truth)
         metrics["seconds_per_frame"] = _stage_seconds(state, time.perf_counter() - started)
         metrics["wall_s"] = round(time.perf_counter() - state.started, 2)
@@ -120,11 +150,18 @@ def errors_of(state: Run) -> dict[str, float | None]:
     if truth is None or len(truth) < 3:
         return dict.fromkeys([*names, "ate_frontend_rmse_cm"])
     errors = trajectory_errors(state.slam.trajectory, truth)
-    frontend = trajectory_errors(state.slam.frontend_trajectory, truth)
     return {
         **{name: _rounded(getattr(errors, name)) for name in names},
-        "ate_frontend_rmse_cm": _rounded(frontend.ate_rmse_cm),
+        "ate_frontend_rmse_cm": _compared(state.slam.frontend_trajectory, truth, "ate_rmse_cm"),
     }
+
+
+def _compared(estimate: Trajectory, truth: Trajectory, name: str) -> float | None:
+    """Return one of the trajectory's errors, None where fewer than three poses can be compared."""
+    try:
+        return _rounded(getattr(trajectory_errors(estimate, truth), name))
+    except DataError:
+        return None
 
 
 def _stage_seconds(state: Run, saving: float) -> dict[str, float]:
@@ -144,20 +181,21 @@ def _listed(values: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
-def _metrics(state: Run, folder: Path) -> dict[str, Any]:
-    """Return everything metrics.json says, and write the pictures the image metrics are taken from."""
+def _metrics(state: Run, of_map: dict[str, Any]) -> dict[str, Any]:
+    """Return everything metrics.json says; `of_map` are the metrics of views and mesh."""
     config, sequence, slam = state.config, state.sequence, state.slam
     truth = _true_trajectory(state)
     frames = len(slam.trajectory)
     mapper = slam.mapper
+    errors = errors_of(state)
     return {
         "dataset": sequence.dataset,
         "scene": sequence.scene,
         "description": sequence.description,
         "method": config.method,
-        **errors_of(state),
+        **errors,
         "path_length_m": _rounded(truth.length()) if truth is not None else None,
-        **_image_metrics(state, folder),
+        **of_map,
         "num_frames": frames,
         "num_lost_frames": sum(not r.converged for r in slam.results),
         "num_keyframes": len(mapper.keyframes) if isinstance(mapper, GaussianMapper) else None,
@@ -174,72 +212,213 @@ def _metrics(state: Run, folder: Path) -> dict[str, Any]:
             f"poses {config.poses}; ATE: SE(3)-aligned rmse over all frames (sim3: with scale), RPE over "
             f"consecutive frames; images: every {config.evaluation.hold_out_every}th depth frame held out "
             "from mapping, rendered at its estimated pose, over pixels with true depth (_all: every "
-            "pixel), corrected by EventNeRF's linear fit in log space"
+            "pixel), corrected by EventNeRF's linear fit in log space, one for each set of views; mapped: "
+            "frames used for mapping; novel: true poses beside the path, moved into the estimate's frame"
         ),
+        "protocols": _protocols(state, errors | of_map),
     }
 
 
-def _image_metrics(state: Run, folder: Path) -> dict[str, Any]:
-    """Render the held-out views, write them beside the truth, and return their metrics."""
-    evaluation, slam = state.config.evaluation, state.slam
-    names = ("psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected")
-    nothing: dict[str, Any] = dict.fromkeys([*names, *(f"{n}_all" for n in names), "depth_l1_cm"])
+# --- views ---
+
+
+@dataclass(frozen=True)
+class _RenderedView:
+    """The map at one pose, and the truth there."""
+
+    kind: str  # held out, mapped or novel
+    timestamp: float  # seconds
+    image: np.ndarray | None  # [H, W] truth
+    depth: np.ndarray | None  # [H, W] metres, truth
+    view: View
+
+
+# What metrics of a kind carry in their names; the headline's are plain.
+SUFFIXES = {"held out": "", "mapped": "_mapped", "novel": "_novel"}
+
+
+def _view_metrics(state: Run, folder: Path) -> tuple[dict[str, Any], LinearFit | None]:
+    """Render views of all kinds, write pictures and a table, and return their metrics.
+
+    The fit is that of the held-out views, None without true images.
+    """
+    metrics: dict[str, Any] = {}
+    rows: list[PictureRow] = []
+    table: list[dict[str, Any]] = []
+    headline: LinearFit | None = None
+    for kind, suffix in SUFFIXES.items():
+        views = list(_rendered(state, kind))
+        measured = _measured(views, state.config.evaluation.lpips_weights)
+        metrics |= _named(views, measured, suffix)
+        fit = None if measured is None else measured.fit
+        if kind == "held out":
+            headline = fit
+        for k, shown in enumerate(views):
+            numbers = _row_numbers(shown, None if measured is None else measured.views[k])
+            name = f"{suffix.removeprefix('_')}{'_' if suffix else ''}{round(1000 * shown.timestamp):06d}.png"
+            table.append({"views": kind, "timestamp_s": f"{shown.timestamp:.3f}", **numbers})
+            row = PictureRow(
+                _caption(shown, numbers),
+                shown.image,
+                shown.view.intensity if fit is None else fit(shown.view.intensity),
+                shown.view.depth,
+            )
+            if kind != "mapped":
+                write_contact_sheet(folder / "renders" / name, [row])
+            if k in _evenly(len(views), CONTACT_ROWS[kind]):
+                rows.append(row)
+    if rows:
+        write_contact_sheet(folder / "renders" / "contact.png", rows, panel_width=256)
+        _write_table(folder / "renders" / "views.csv", table)
+    return metrics, headline
+
+
+def _rendered(state: Run, kind: str) -> Iterator[_RenderedView]:
+    """Render the views of a kind, at most `max_images` spread evenly, none without a map."""
+    slam, camera = state.slam, state.sequence.camera
     if slam.mapper is None:
-        return nothing
-    indices = sorted(k for k in state.held_out if k < len(slam.trajectory))
-    indices = [indices[k] for k in _evenly(len(indices), evaluation.max_images)]
-    views: list[View] = []
-    samples = [state.samples[k] for k in indices]
-    for k in indices:
-        views.append(slam.mapper.render(state.sequence.camera, slam.trajectory.pose(k)))
-    metrics = dict(nothing)
-    renders, captions = [v.intensity for v in views], [""] * len(views)
-    truths = [s.image for s in samples if s.image is not None]
-    if views and len(truths) == len(views):
-        masks = [s.depth > 0 if s.depth is not None else None for s in samples]
-        measured = evaluate_images(renders, truths, masks, lpips_weights=evaluation.lpips_weights)
-        for name in nothing:
-            if hasattr(measured, name):
-                metrics[name] = _rounded(getattr(measured, name))
-        captions = _captions(renders, truths, masks)
-    pairs = [(v.depth, s.depth) for v, s in zip(views, samples) if s.depth is not None]
-    drawn = [np.where(rendered > 0, true, 0) for rendered, true in pairs]  # only where something is drawn
-    if pairs:
-        metrics["depth_l1_cm"] = _rounded(depth_l1_cm([rendered for rendered, _ in pairs], drawn))
-    metrics["num_held_out_views"] = len(views)
-    write_render_triptychs(
-        folder / "renders",
-        timestamps=[s.timestamp for s in samples],
-        renders=renders,
-        truths=[s.image for s in samples],
-        depths=[v.depth for v in views],
-        captions=captions,
-    )
-    return metrics
-
-
-def _captions(
-    renders: list[np.ndarray],  # V of [H, W]
-    truths: list[np.ndarray],  # V of [H, W]
-    masks: list[np.ndarray | None],  # V of [H, W] bool, counted pixels
-) -> list[str]:
-    """Return each view's PSNR after the fit over all views."""
-    counted = [np.zeros(t.shape, bool) if m is None else m for t, m in zip(truths, masks)]
-    if not any(m.any() for m in counted):
-        return [""] * len(renders)
-    fit = fit_event_nerf(renders, truths, counted)
-    return [
-        f"PSNR {psnr([fit(r)], [t], [m]):.1f} dB corrected" if m.any() else ""
-        for r, t, m in zip(renders, truths, counted)
-    ]
-
-
-def _write_map(state: Run, mapper: Mapper, folder: Path) -> None:
-    """Write map.ply (Gaussian maps), points.ply and mesh.ply."""
-    points, brightness = mapper.points()
-    if len(points) == 0:
-        state.note("the map is empty: no map.ply, points.ply, mesh.ply")
         return
+    most = state.config.evaluation.max_images
+    if kind == "novel":
+        yield from _novel_views(state, slam.mapper, most)
+        return
+    held_out = sorted(k for k in state.held_out if k < len(slam.trajectory))
+    indices = held_out
+    if kind == "mapped":  # as many as were held out
+        most = min(most, len(held_out))
+        seen = np.flatnonzero(state.samples.has_depth[: len(slam.trajectory)])
+        indices = [int(k) for k in seen if k not in state.held_out]
+    for k in (indices[j] for j in _evenly(len(indices), most)):
+        sample = state.samples[k]
+        view = slam.mapper.render(camera, slam.trajectory.pose(k))
+        yield _RenderedView(kind, sample.timestamp, sample.image, sample.depth, view)
+
+
+def _novel_views(state: Run, mapper: Mapper, most: int) -> Iterator[_RenderedView]:
+    """Render at the true poses beside the path, moved into the estimate's frame."""
+    trajectory, truth = state.slam.trajectory, _true_trajectory(state)
+    if truth is None:
+        return
+    start, end = trajectory.timestamps[[0, -1]]
+    novel = [v for v in state.sequence.novel_views() if start <= v.timestamp <= end]
+    T_estimate_truth = np.linalg.inv(align_views(trajectory.resampled(truth.timestamps).poses, truth.poses))
+    for true in (novel[k] for k in _evenly(len(novel), most)):
+        view = mapper.render(state.sequence.camera, orthonormalized(T_estimate_truth @ true.T_world_camera))
+        yield _RenderedView("novel", true.timestamp, true.image, true.depth, view)
+
+
+def _measured(views: list[_RenderedView], lpips_weights: Path | None) -> ImageMetrics | None:
+    truths = [v.image for v in views if v.image is not None]
+    if not views or len(truths) < len(views):
+        return None
+    masks = [None if v.depth is None else v.depth > 0 for v in views]
+    return evaluate_images([v.view.intensity for v in views], truths, masks, lpips_weights)
+
+
+def _named(views: list[_RenderedView], measured: ImageMetrics | None, suffix: str) -> dict[str, Any]:
+    """Return metrics under their names in metrics.json, None where there is nothing to measure."""
+    kind = suffix or "_held_out"
+    named: dict[str, Any] = {}
+    for extent in ("", "_all"):
+        for name in ("psnr{}_db", "psnr{}_corrected_db", "ssim{}_corrected", "lpips{}_corrected"):
+            value = None if measured is None else getattr(measured, name.format("") + extent)
+            named[name.format(suffix) + extent] = _rounded(value)
+    for name in ("ssim{}_all", "lpips{}_all"):
+        value = None if measured is None else getattr(measured, name.format(""))
+        named[name.format(suffix)] = _rounded(value)
+    named[f"depth_l1{suffix}_cm"] = _rounded(_depth_l1_cm(views))
+    named[f"num{kind}_views"] = len(views)
+    return named
+
+
+def _depth_l1_cm(views: list[_RenderedView]) -> float | None:
+    """Return the depth error over pixels with true depth where something is drawn."""
+    pairs = [(v.view.depth, v.depth) for v in views if v.depth is not None]
+    drawn = [np.where(rendered > 0, true, 0) for rendered, true in pairs]
+    return depth_l1_cm([rendered for rendered, _ in pairs], drawn) if pairs else None
+
+
+def _row_numbers(shown: _RenderedView, measured: ViewMetrics | None) -> dict[str, float | None]:
+    depth_l1 = _depth_l1_cm([shown])
+    if measured is None:
+        measured = ViewMetrics(None, None, None)
+    return {
+        "psnr_corrected_db": measured.psnr_corrected_db,
+        "ssim_corrected": measured.ssim_corrected,
+        "lpips_corrected": measured.lpips_corrected,
+        "depth_l1_cm": depth_l1,
+    }
+
+
+def _caption(shown: _RenderedView, numbers: dict[str, float | None]) -> str:
+    parts = [f"{shown.kind}, t = {shown.timestamp:.3f} s"]
+    for name, text in (
+        ("psnr_corrected_db", "PSNR {:.1f} dB corrected"),
+        ("ssim_corrected", "SSIM {:.3f}"),
+        ("lpips_corrected", "LPIPS {:.3f}"),
+        ("depth_l1_cm", "depth L1 {:.2f} cm"),
+    ):
+        value = numbers[name]
+        if value is not None:
+            parts.append(text.format(value))
+    return "    ".join(parts)
+
+
+def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    with atomic_file(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def _protocols(state: Run, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return the results under the paper's protocol and under IncEventGS's."""
+    truth, trajectory = _true_trajectory(state), state.slam.trajectory
+    full = {
+        "trajectory": "whole run, rmse after SE(3) alignment",
+        "images": "held-out views, pixels with true depth, all after EventNeRF's fit",
+        "ate_rmse_cm": metrics["ate_rmse_cm"],
+        **{name: metrics[name] for name in ("psnr_corrected_db", "ssim_corrected", "lpips_corrected")},
+    }
+    slice_s = None
+    if truth is not None and state.sequence.truth is not None and state.sequence.dataset == "event_replica":
+        slice_s = inceventgs_slice(state.sequence.scene, state.sequence.truth, trajectory)
+    ate, measured = None, None
+    if truth is not None:
+        start, end = slice_s or (-np.inf, np.inf)
+        inside = (trajectory.timestamps >= start) & (trajectory.timestamps <= end)
+        part = Trajectory(trajectory.timestamps[inside], trajectory.poses[inside])
+        ate = _compared(part, truth, "ate_rmse_sim3_cm")
+    if slice_s is None:
+        names = {"psnr_corrected_db": "psnr_corrected_db_all", "ssim": "ssim_all", "lpips": "lpips_all"}
+        images = {name: metrics[source] for name, source in names.items()}
+    else:
+        views = [v for v in _rendered(state, "held out") if slice_s[0] <= v.timestamp <= slice_s[1]]
+        measured = _measured(views, state.config.evaluation.lpips_weights)
+        images = {
+            "psnr_corrected_db": _rounded(measured.psnr_corrected_db_all) if measured else None,
+            "ssim": _rounded(measured.ssim_all) if measured else None,
+            "lpips": _rounded(measured.lpips_all) if measured else None,
+        }
+    where = (
+        f"their slice, {slice_s[0]:g} to {slice_s[1]:g} s" if slice_s else "whole run (no slice of theirs)"
+    )
+    inceventgs = {
+        "trajectory": f"{where}, rmse after Sim(3) alignment",
+        "images": "held-out views, all pixels; PSNR after EventNeRF's fit, SSIM and LPIPS before it",
+        "ate_rmse_sim3_cm": ate,
+        **images,
+    }
+    return {"full": full, "inceventgs": inceventgs}
+
+
+# --- the map ---
+
+
+def _write_map(state: Run, mapper: Mapper, folder: Path) -> Any | None:
+    """Write map.ply (Gaussian maps), points.ply and mesh.ply; return the mesh, None where there is none."""
+    points, brightness = mapper.points()
     write_points(folder / "points.ply", points, brightness)
     if isinstance(mapper, GaussianMapper):
         raw = {name: value.detach().numpy() for name, value in mapper.gaussians.raw.items()}
@@ -251,16 +430,61 @@ def _write_map(state: Run, mapper: Mapper, folder: Path) -> None:
             raw["logit_opacities"],
             mapper.gaussians.activated().colors.detach().numpy(),
         )
-    trajectory = state.slam.trajectory
 
     def views() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        for k in _evenly(len(trajectory), MESH_VIEWS):
-            view = mapper.render(state.sequence.camera, trajectory.pose(k))
-            yield np.where(view.alpha > 0.9, view.depth, 0), view.intensity, trajectory.pose(k)
+        for T in spread_poses(state.slam.trajectory):
+            view = mapper.render(state.sequence.camera, T)
+            opaque = np.where(view.alpha > MESH_ALPHA, view.depth, 0)
+            yield without_depth_edges(opaque), view.intensity, T
 
     try:
-        write_mesh(folder / "mesh.ply", fuse_mesh(views(), state.sequence.camera, MESH_VOXEL))
+        mesh = fuse_mesh(views(), state.sequence.camera, MESH_VOXEL)
+        write_mesh(folder / "mesh.ply", mesh)
     except DataError as error:  # a map too thin for a surface: the other results stand
+        state.note(str(error))
+        return None
+    return mesh
+
+
+def spread_poses(trajectory: Trajectory) -> list[np.ndarray]:  # [4, 4] each
+    """Return poses of a path, each at least a step or a turn from the one before, and the last."""
+    chosen = [trajectory.pose(0)]
+    for T in trajectory.poses[1:]:
+        motion = np.linalg.inv(chosen[-1]) @ T
+        if np.linalg.norm(motion[:3, 3]) > MESH_STEP or rotation_angle_deg(motion) > MESH_TURN:
+            chosen.append(T)
+    if not np.array_equal(chosen[-1], trajectory.pose(-1)):
+        chosen.append(trajectory.pose(-1))
+    return chosen
+
+
+def _mesh_metrics(state: Run, mesh: Any | None) -> dict[str, float | None]:
+    """Return the mesh's errors against the true surfaces that the camera saw; None without them."""
+    names = ("mesh_accuracy_cm", "mesh_completion_cm", "mesh_completion_ratio_5cm")
+    truth, sequence = _true_trajectory(state), state.sequence
+    if mesh is None or sequence.surfaces_file is None or truth is None:
+        return dict.fromkeys(names)
+    surfaces = TrueSurfaces(sequence.surfaces_file)
+    end = truth.timestamps[-1]
+    beside = [v.T_world_camera for v in sequence.novel_views() if v.timestamp <= end]
+    seen = surfaces.seen_points(sequence.camera, [*spread_poses(truth), *beside])
+    estimate = state.slam.trajectory.resampled(truth.timestamps)
+    errors = surfaces.errors(mesh, seen, align_views(estimate.poses, truth.poses))
+    values = (errors.accuracy_cm, errors.completion_cm, errors.completion_ratio)
+    return {name: _rounded(value) for name, value in zip(names, values)}
+
+
+def _write_fly_through(state: Run, mapper: Mapper, fit: LinearFit | None, path: Path) -> None:
+    """Write a video of the map along the smoothed path, brightness corrected where the truth is known."""
+
+    def views() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for T in smooth_path(state.slam.trajectory, VIDEO_FPS, state.config.evaluation.flythrough_frames):
+            view = mapper.render(state.sequence.camera, T)
+            yield view.intensity if fit is None else fit(view.intensity), view.depth
+
+    try:
+        write_video(path, fly_through_frames(views()), VIDEO_FPS)
+    except NoEncoderError as error:  # the other results stand
         state.note(str(error))
 
 

@@ -1,4 +1,4 @@
-"""Seeing a run: plots of trajectories and renders (matplotlib, no display) and an Open3D window."""
+"""Seeing a run: plots of trajectories and maps (matplotlib, no display) and an Open3D window."""
 
 import json
 import os
@@ -9,19 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError, EdSlamError
+from edslam_ti.evaluation import trajectory_errors
 from edslam_ti.mapping import GaussianMapper, Mapper
 from edslam_ti.open3d_loader import load_open3d
-from edslam_ti.output import atomic_file
+from edslam_ti.pictures import new_figure, save_figure
 from edslam_ti.trajectory import Trajectory, read_tum
 from edslam_ti.volume import MeshView
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Colour-blind safe (Okabe and Ito); the truth is black.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -48,27 +47,21 @@ class AlignedPath:
 
 
 def align_to_truth(estimate: Trajectory, truth: Trajectory | None) -> AlignedPath:
-    """Return the estimate under the rigid motion that minimises its squared distances to the truth.
+    """Return the estimate under the rigid motion that ATE uses.
 
-    Without truth, or with fewer than two poses inside its time range, the estimate stays as it is.
+    Without truth, or with fewer than three poses inside its time range, the estimate stays as it is.
     """
     positions = estimate.poses[:, :3, 3]
-    errors = np.full(len(positions), np.nan)
+    unknown = np.full(len(positions), np.nan)
     if truth is None:
-        return AlignedPath(positions, errors)
-    known = np.array([truth.covers(t) for t in estimate.timestamps], dtype=bool)
-    if np.count_nonzero(known) < 2:
-        return AlignedPath(positions, errors)
-    target = np.array([truth.at(t)[:3, 3] for t in estimate.timestamps[known]])
-    source = positions[known]
-    source_mean, target_mean = source.mean(0), target.mean(0)
-    # Kabsch 1976; a camera that stood still fixes no rotation.
-    rotation = Rotation.identity()
-    if np.ptp(source, axis=0).max() > 0 and np.ptp(target, axis=0).max() > 0:
-        rotation, _ = Rotation.align_vectors(target - target_mean, source - source_mean)
-    aligned = rotation.apply(positions - source_mean) + target_mean
-    errors[known] = np.linalg.norm(aligned[known] - target, axis=1)
-    return AlignedPath(aligned, errors)
+        return AlignedPath(positions, unknown)
+    try:
+        compared = trajectory_errors(estimate, truth)
+    except DataError:  # too few poses to compare: there is something to draw all the same
+        return AlignedPath(positions, unknown)
+    unknown[compared.indices] = compared.errors_cm / 100
+    T = compared.T_truth_estimate
+    return AlignedPath(positions @ T[:3, :3].T + T[:3, 3], unknown)
 
 
 def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> None:
@@ -81,7 +74,7 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
     }
     if not paths:
         raise DataError(f"{path.name}: expected at least one trajectory with poses, got none")
-    figure = _figure(11, 5)
+    figure = new_figure(11, 5)
     views = _top_and_side(next(e for e in estimates.values() if len(e)) if truth is None else truth)
     axes = figure.subplots(1, 2)
     for ax, view in zip(axes, views):
@@ -103,7 +96,7 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
         ", ".join(_with_ate(name, aligned) for name, aligned in paths.items())
         + ("" if truth is None else " (rigidly aligned)")
     )
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 @dataclass(frozen=True)
@@ -171,13 +164,13 @@ def _with_ate(name: str, aligned: AlignedPath) -> str:
     return name if np.isnan(aligned.ate_rmse) else f"{name}: ATE {100 * aligned.ate_rmse:.2f} cm rmse"
 
 
-# ---------------------------------------------------------------- renders
+# ---------------------------------------------------------------- comparisons
 
 
 def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]], label: str) -> None:
     """Draw every value of every series as a dot, group beside group, and each series' median as a bar."""
     series = list(dict.fromkeys(name for values in groups.values() for name in values))
-    figure = _figure(max(5.0, 1.0 + 1.4 * len(groups)), 4.0)
+    figure = new_figure(max(5.0, 1.0 + 1.4 * len(groups)), 4.0)
     ax = figure.add_subplot()
     for k, (name, colour) in enumerate(zip(series, _colours())):
         shift = 0.8 * ((k + 0.5) / len(series) - 0.5)
@@ -194,12 +187,12 @@ def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]],
     ax.set_ylabel(label)
     ax.grid(axis="y", alpha=0.3)
     _legend(ax)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_drift(path: Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Draw the error (cm) over the path travelled (m) of each curve, the first poses laid together."""
-    figure = _figure(7.0, 4.0)
+    figure = new_figure(7.0, 4.0)
     ax = figure.add_subplot()
     for (name, (travelled, error)), colour in zip(curves.items(), _colours()):
         ax.plot(travelled, error, color=colour, label=name, lw=1)
@@ -207,76 +200,7 @@ def plot_drift(path: Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) 
     ax.set_ylabel("distance from the truth [cm]")
     ax.grid(alpha=0.3)
     _legend(ax)
-    _save(figure, path)
-
-
-def write_render_triptychs(
-    folder: Path,
-    timestamps: Sequence[float],  # seconds
-    renders: Sequence[np.ndarray],  # [H, W] brightness in [0, 1]
-    truths: Sequence[np.ndarray | None],  # [H, W] brightness in [0, 1]
-    depths: Sequence[np.ndarray],  # [H, W] metres, 0 = nothing drawn
-    captions: Sequence[str] = (),  # metrics to print beside the time
-) -> list[Path]:
-    """Write render | truth | depth side by side, one PNG per view named by its milliseconds."""
-    texts = captions or [""] * len(timestamps)
-    paths = []
-    for t, render, truth, depth, text in zip(timestamps, renders, truths, depths, texts, strict=True):
-        paths.append(folder / f"{round(1000 * t):06d}.png")
-        _write_triptych(paths[-1], f"t = {t:.3f} s   {text}", render, truth, depth)
-    return paths
-
-
-def _write_triptych(
-    path: Path, caption: str, render: np.ndarray, truth: np.ndarray | None, depth: np.ndarray
-) -> None:
-    height, width = render.shape
-    for name, image in (("truth", truth), ("depth", depth)):
-        if image is not None and image.shape != render.shape:
-            raise DataError(f"{name}: expected shape {render.shape} as the render's, got {image.shape}")
-    zoom = max(1, round(320 / width))  # small images are enlarged by a whole number
-    w, h, gap, head, foot = width * zoom, height * zoom, 8, 44, 40
-    total_w, total_h = 3 * w + 4 * gap, head + h + foot
-    figure = _figure(total_w / 100, total_h / 100, dpi=100, layout="none")
-
-    def panel(column: int, title: str) -> "Axes":
-        left = gap + column * (w + gap)
-        ax = figure.add_axes((left / total_w, foot / total_h, w / total_w, h / total_h))
-        ax.set_axis_off()
-        figure.text((left + w / 2) / total_w, (foot + h + 5) / total_h, title, ha="center", fontsize=9)
-        return ax
-
-    grey: dict[str, Any] = {
-        "cmap": "gray",
-        "vmin": 0.0,
-        "vmax": 1.0,
-        "interpolation": "nearest",
-        "aspect": "auto",
-    }
-    panel(0, "render").imshow(render, **grey)
-    truth_axes = panel(1, "truth")
-    if truth is None:
-        truth_axes.imshow(np.full(render.shape, 0.92), **grey)
-        truth_axes.text(0.5, 0.5, "no truth", transform=truth_axes.transAxes, ha="center", color="0.4")
-    else:
-        truth_axes.imshow(truth, **grey)
-    known = depth > 0
-    near, far = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
-    drawn = panel(2, "depth").imshow(
-        np.ma.masked_array(depth, ~known),
-        cmap="viridis",
-        vmin=near,
-        vmax=max(far, near + 1e-3),
-        interpolation="nearest",
-        aspect="auto",
-    )
-    left = gap + 2 * (w + gap)
-    scale = figure.add_axes(((left + 0.1 * w) / total_w, 24 / total_h, 0.8 * w / total_w, 9 / total_h))
-    bar = figure.colorbar(drawn, cax=scale, orientation="horizontal", ticks=list(np.linspace(near, far, 3)))
-    bar.ax.set_xticklabels([f"{d:.2f} m" for d in np.linspace(near, far, 3)], fontsize=7)
-    bar.ax.tick_params(length=2, pad=2)
-    figure.text(gap / total_w, 1 - 16 / total_h, caption, fontsize=9, fontweight="bold")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 # ---------------------------------------------------------------- finished runs
@@ -345,7 +269,7 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
     runs = [load_result(folder) for folder in results]
     if not runs:
         raise DataError("results: expected at least one results folder, got none")
-    figure = _figure(12, 9)
+    figure = new_figure(12, 9)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.15, 1))
     overview = figure.add_subplot(grid[0, :])
     _draw_overview(overview, runs)
@@ -362,7 +286,7 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
         _finish_axes(ax, view)
         if k == 0:
             _legend(ax)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_points(ax: "Axes", runs: Sequence[Result], view: _PlanarView) -> None:
@@ -585,22 +509,7 @@ def fill_cloud(o3d: Any, cloud: Any, points: np.ndarray, brightness: np.ndarray)
     cloud.colors = o3d.utility.Vector3dVector(np.repeat(grey, 3, axis=1).astype(np.float64))
 
 
-# ---------------------------------------------------------------- matplotlib without global state
-
-
-def _figure(width: float, height: float, dpi: int = 120, layout: Any = "constrained") -> "Figure":
-    """Return a figure (inches) that belongs to nobody: no pyplot, so no display and no leak."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), dpi=dpi, layout=layout)
-
-
-def _save(figure: "Figure", path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
-    with atomic_file(path) as temporary:
-        figure.savefig(temporary, facecolor="white")
+# ---------------------------------------------------------------- matplotlib
 
 
 def _legend(ax: "Axes") -> None:

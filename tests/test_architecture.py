@@ -23,7 +23,10 @@ RANKS: list[list[str]] = [
     ],
     ["edslam_ti.frame", "edslam_ti.tracking", "edslam_ti.keyframes", "edslam_ti.mapping"],
     ["edslam_ti.slam"],
-    ["edslam_ti.baselines.*", "edslam_ti.evaluation", "edslam_ti.export", "edslam_ti.visualization"],
+    [
+        *("edslam_ti.baselines.*", "edslam_ti.evaluation", "edslam_ti.surface_errors", "edslam_ti.export"),
+        *("edslam_ti.pictures", "edslam_ti.visualization"),
+    ],
     ["edslam_ti.command_line", "edslam_ti.results", "edslam_ti.pipeline"],
     [f"edslam_ti.reproduce{part}" for part in ("", ".cases", ".altered", ".recordings", ".runs", ".report")],
     ["apps.*"],
@@ -43,16 +46,19 @@ LIBRARIES: dict[str, list[str]] = {
     "yaml": ["edslam_ti.config"],
     "scipy": [
         *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.brightness", "edslam_ti.mapping"),
-        "edslam_ti.visualization",
+        "edslam_ti.pictures",
     ],
-    "cv2": ["edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.mapping"],
+    "cv2": [
+        *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.mapping"),
+        "edslam_ti.pictures",
+    ],
     "OpenEXR": ["edslam_ti.datasets.*"],
     "platformdirs": ["edslam_ti.datasets.*"],
     "evo": ["edslam_ti.evaluation"],
     "skimage": ["edslam_ti.evaluation"],
     "kiss_icp": ["edslam_ti.baselines.*"],
     "lpips": ["edslam_ti.evaluation"],
-    "matplotlib": ["edslam_ti.visualization"],
+    "matplotlib": ["edslam_ti.pictures", "edslam_ti.visualization"],
     "rich": [
         "edslam_ti.datasets.*",
         "edslam_ti.results",
@@ -64,6 +70,7 @@ LIBRARIES: dict[str, list[str]] = {
     "tyro": ["edslam_ti.command_line", "apps.*"],
 }
 USES_OPEN3D = [
+    "edslam_ti.surface_errors",
     *("edslam_ti.simulation.*", "edslam_ti.pointcloud", "edslam_ti.volume"),
     *("edslam_ti.baselines.*", "edslam_ti.export", "edslam_ti.visualization"),
 ]

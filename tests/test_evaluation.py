@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation import (
     Lpips,
+    align_views,
     depth_l1_cm,
     evaluate_images,
     fit_event_nerf,
+    inceventgs_slice,
     load_lpips,
     psnr,
     ssim,
@@ -123,6 +125,34 @@ def test_fewer_than_three_common_poses_are_refused() -> None:
         trajectory_errors(later, helix())
 
 
+def test_views_of_a_short_noisy_path_are_aligned_by_their_orientations() -> None:
+    random = np.random.default_rng(0)
+    truth = helix(40).poses
+    truth[:, :3, 3] *= 0.01  # a path of centimetres
+    estimated = np.linalg.inv(SOME_MOTION) @ truth
+    assert align_views(estimated, truth) == pytest.approx(SOME_MOTION, abs=1e-9)
+    estimated[:, :3, 3] += random.normal(0, 1e-3, (40, 3))  # 1 mm
+    from_positions = trajectory_errors(
+        Trajectory(helix(40).timestamps, estimated), Trajectory(helix(40).timestamps, truth)
+    ).T_truth_estimate
+
+    def turned(T: np.ndarray) -> float:
+        return float(np.degrees(Rotation.from_matrix((T @ np.linalg.inv(SOME_MOTION))[:3, :3]).magnitude()))
+
+    assert turned(align_views(estimated, truth)) < 0.02
+    assert turned(from_positions) > 0.2
+
+
+def test_slice_of_inceventgs_counts_every_second_pose() -> None:
+    t = 0.1 + 0.05 * np.arange(200)
+    truth = Trajectory(t, np.tile(np.eye(4), (200, 1, 1)))
+    slice_s = inceventgs_slice("office0", truth, truth)  # 10:60 of every second pose
+    assert slice_s == pytest.approx((1.1, 6.1))
+    assert inceventgs_slice("office0", truth, Trajectory(t[40:], truth.poses[40:])) is None
+    assert inceventgs_slice("office3", truth, truth) is None  # 200 to 300: later than this path
+    assert inceventgs_slice("kitchen", truth, truth) is None
+
+
 def pictures(count: int = 3, height: int = 40, width: int = 48) -> list[np.ndarray]:
     """Smooth random pictures in [0, 1]."""
     random = np.random.default_rng(0)
@@ -185,6 +215,30 @@ def test_views_without_depth_count_only_over_all_pixels() -> None:
     assert metrics.psnr_db_all > 20
     with pytest.raises(DataError, match="differ in size"):
         evaluate_images([truths[0][1:]], truths[:1], [None])
+
+
+def test_every_view_has_its_numbers_and_they_make_the_sets() -> None:
+    truths = pictures(3)
+    random = np.random.default_rng(1)
+    predictions = [t + random.normal(0, 0.05 * k, t.shape) for k, t in enumerate(truths, 1)]
+    masks = [np.ones(t.shape, bool) for t in truths]
+    masks[0][:, 20:] = False
+    masks[2][:] = False
+    metrics = evaluate_images(predictions, truths, masks)
+    one, two, three = metrics.views
+    assert one.psnr_corrected_db is not None
+    assert two.psnr_corrected_db is not None
+    assert three.psnr_corrected_db is None
+    squares = [
+        10 ** (-v / 10) * m.sum()
+        for v, m in ((one.psnr_corrected_db, masks[0]), (two.psnr_corrected_db, masks[1]))
+    ]
+    expected = -10 * np.log10(sum(squares) / (masks[0].sum() + masks[1].sum()))
+    assert metrics.psnr_corrected_db == pytest.approx(expected)
+    assert metrics.ssim_corrected == pytest.approx(np.mean([one.ssim_corrected, two.ssim_corrected]))
+    assert metrics.ssim_all == pytest.approx(
+        ssim(predictions, truths, [np.ones(t.shape, bool) for t in truths])
+    )
 
 
 def test_a_render_of_one_brightness_is_only_offset() -> None:

@@ -1,5 +1,6 @@
 """Whole runs on the tiny room, from a folder of events and depth to a folder of results."""
 
+import csv
 import io
 import json
 import shutil
@@ -30,7 +31,7 @@ from edslam_ti.trajectory import read_tum
 FEW = {"iterations": 1, "initial_iterations": 10, "final_iterations": 10}
 ARTEFACTS = {
     *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "trajectory.png"),
-    *("map.ply", "mesh.ply", "points.ply"),
+    *("map.ply", "mesh.ply", "points.ply", "flythrough.mp4"),
     *("config.yaml", "metrics.json", "log.txt", "renders"),
 }
 KEYS = {
@@ -145,11 +146,56 @@ def test_map_holds_the_gaussians_that_were_counted(result: Path) -> None:
     assert (high < [3.2, 3.2, 2.6]).all()
 
 
-def test_renders_are_of_held_out_views(result: Path) -> None:
-    names = sorted(path.name for path in (result / "renders").iterdir())
-    assert names == ["000150.png", "000400.png", "000650.png"]  # ms; every fifth from the third on
-    picture = cv2.imread(str(result / "renders" / names[0]))
-    assert picture.shape[1] > 3 * 120  # render | truth | depth
+def test_renders_are_of_held_out_and_novel_views(result: Path) -> None:
+    names = {path.name for path in (result / "renders").iterdir()}
+    held_out = ["000150.png", "000400.png", "000650.png"]  # ms; every fifth from the third on
+    novel = [f"novel_{ms:06d}.png" for ms in (88, 262, 438, 612)]
+    assert names == {*held_out, *novel, "contact.png", "views.csv"}
+    one, sheet = (cv2.imread(str(result / "renders" / name)) for name in ("000150.png", "contact.png"))
+    assert one.shape[1] > 4 * 360  # truth | render | error | depth, enlarged threefold
+    assert sheet.shape[0] > 7 * 160  # 3 + 4 views, enlarged twofold
+
+
+def test_views_used_for_mapping_held_out_and_beside_the_path_are_reported_apart(result: Path) -> None:
+    metrics = metrics_of(result)
+    for suffix, kind, count in (("", "held_out", 3), ("_mapped", "mapped", 3), ("_novel", "novel", 4)):
+        assert metrics[f"num_{kind}_views"] == count
+        assert 10 < metrics[f"psnr{suffix}_corrected_db"] < 40
+        assert 0 < metrics[f"ssim{suffix}_corrected"] < 1
+        assert 0 < metrics[f"depth_l1{suffix}_cm"] < 20
+    with (result / "renders" / "views.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["views"] for row in rows] == ["held out"] * 3 + ["mapped"] * 3 + ["novel"] * 4
+    held_out = [float(row["depth_l1_cm"]) for row in rows[:3]]
+    assert np.mean(held_out) == pytest.approx(metrics["depth_l1_cm"], rel=0.05)
+    errors = [10 ** (-float(row["psnr_corrected_db"]) / 10) for row in rows[:3]]
+    assert -10 * np.log10(np.mean(errors)) == pytest.approx(metrics["psnr_corrected_db"], abs=0.05)
+
+
+def test_mesh_is_compared_with_the_true_surfaces(result: Path) -> None:
+    metrics = metrics_of(result)
+    assert 0 < metrics["mesh_accuracy_cm"] < 5  # images of 120 x 80 pixels: 4 cm a pixel
+    assert 0 < metrics["mesh_completion_cm"] < 10
+    assert 0.6 < metrics["mesh_completion_ratio_5cm"] <= 1
+
+
+def test_fly_through_is_a_video_of_render_and_depth(result: Path) -> None:
+    video = cv2.VideoCapture(str(result / "flythrough.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 10  # 0.65 s, 15 a second
+    ok, frame = video.read()
+    assert ok
+    assert frame.shape == (80, 240, 3)
+
+
+def test_both_protocols_are_named(result: Path) -> None:
+    metrics = metrics_of(result)
+    full, theirs = metrics["protocols"]["full"], metrics["protocols"]["inceventgs"]
+    assert full["ate_rmse_cm"] == metrics["ate_rmse_cm"]
+    assert full["psnr_corrected_db"] == metrics["psnr_corrected_db"]
+    assert theirs["ate_rmse_sim3_cm"] == metrics["ate_rmse_sim3_cm"]
+    assert theirs["psnr_corrected_db"] == metrics["psnr_corrected_db_all"]
+    assert theirs["ssim"] == metrics["ssim_all"] != metrics["ssim_corrected_all"]
+    assert "no slice of theirs" in theirs["trajectory"]
 
 
 def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
@@ -184,7 +230,8 @@ def test_held_out_frames_have_depth_and_are_never_the_first() -> None:
 
 def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, mapping={"enabled": False}))
-    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply", "mesh.ply", "points.ply", "renders"}
+    of_the_map = {"map.ply", "mesh.ply", "points.ply", "flythrough.mp4", "renders"}
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - of_the_map
     metrics = metrics_of(folder)
     assert metrics["ate_rmse_cm"] < 0.2
     assert metrics["psnr_corrected_db"] is None

@@ -5,7 +5,7 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.pointcloud import SMALLEST_SCALE, depth_to_points, nearest_neighbour_scales
+from edslam_ti.pointcloud import depth_to_points
 
 CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
 
@@ -63,25 +63,3 @@ def test_no_usable_depth_gives_empty_arrays() -> None:
 def test_depth_of_another_size_is_an_error() -> None:
     with pytest.raises(DataError, match=r"depth: expected shape \(6, 8\) .* got \(8, 6\)"):
         depth_to_points(random_depth().T, CAMERA, np.eye(4))
-
-
-def test_spacing_of_a_grid_is_its_step() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(5) * 0.05] * 3), -1).reshape(-1, 3)
-    np.testing.assert_allclose(nearest_neighbour_scales(grid), 0.05, rtol=1e-4)
-
-
-def test_spacing_is_the_mean_of_the_nearest_distances() -> None:
-    points = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
-    distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    expected = np.sort(distances, axis=1)[:, 1:4].mean(1)
-    np.testing.assert_allclose(nearest_neighbour_scales(points), expected, rtol=1e-4)
-
-
-def test_coinciding_points_keep_a_positive_scale() -> None:
-    scales = nearest_neighbour_scales(np.ones((3, 3)))
-    np.testing.assert_allclose(scales, SMALLEST_SCALE)
-
-
-def test_a_single_point_has_no_spacing() -> None:
-    with pytest.raises(DataError, match="at least 2"):
-        nearest_neighbour_scales(np.zeros((1, 3)))

@@ -28,7 +28,6 @@ from edslam_ti.visualization import (
     path_lines,
     plot_trajectory,
     show_results,
-    write_render_triptychs,
 )
 
 CAMERA = Camera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
@@ -113,7 +112,7 @@ def test_poses_outside_the_truth_have_no_error() -> None:
 
 def test_camera_that_stood_still_is_drawn(tmp_path: Path) -> None:
     still = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
-    assert align_to_truth(still, still).ate_rmse == 0
+    assert align_to_truth(still, still).ate_rmse < 1e-9
     plot_trajectory(tmp_path / "trajectory.png", {"ed_slam": still}, still)
     assert is_picture(tmp_path / "trajectory.png")
 
@@ -137,41 +136,6 @@ def test_plot_without_poses_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="at least one trajectory"):
         plot_trajectory(tmp_path / "trajectory.png", {"ed_slam": Trajectory()}, curve())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_triptych_shows_render_truth_and_depth_pixel_by_pixel(tmp_path: Path) -> None:
-    height, width = 60, 320  # not enlarged: one image pixel is one picture pixel
-    random = np.random.default_rng(0)
-    render, truth = random.random((2, height, width))
-    depth = np.tile(np.linspace(0.5, 3.0, width), (height, 1))
-    depth[:, :10] = 0
-    (path,) = write_render_triptychs(tmp_path, [1.25], [render], [truth], [depth], ["PSNR 30 dB"])
-    assert path == tmp_path / "001250.png"
-    picture = cv2.imread(str(path)).astype(int)  # BGR
-    grey = picture[..., 0]
-    assert picture.shape[1] == 3 * width + 4 * 8
-    for column, expected in ((0, render), (1, truth)):
-        left = 8 + column * (width + 8)
-        panel = grey[44 : 44 + height, left : left + width]
-        assert np.abs(panel - 255 * expected).max() <= 2  # 8 bits, and matplotlib's 256 greys
-    left = 8 + 2 * (width + 8)
-    assert (picture[44 : 44 + height, left : left + 10] == 255).all()  # nothing drawn: white
-    near, far = picture[60, left + 15], picture[60, left + width - 5]
-    assert near[0] > near[1]  # viridis: violet near,
-    assert far[1] > far[0]  # yellow far
-
-
-def test_missing_truth_leaves_a_labelled_blank(tmp_path: Path) -> None:
-    image = np.zeros((60, 320))
-    (path,) = write_render_triptychs(tmp_path, [0.0], [image], [None], [image])
-    panel = cv2.imread(str(path))[44 : 44 + 60, 8 + 328 : 8 + 328 + 320]
-    assert (panel[:10] > 220).all()  # light grey,
-    assert (panel[20:40] < 150).any()  # with dark letters
-
-
-def test_image_of_another_size_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"truth: expected shape \(6, 8\)"):
-        write_render_triptychs(tmp_path, [0.0], [np.zeros((6, 8))], [np.zeros((8, 6))], [np.zeros((6, 8))])
 
 
 def test_finished_runs_are_drawn_into_one_picture(result_folder: Path, tmp_path: Path) -> None:

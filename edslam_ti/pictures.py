@@ -1,0 +1,215 @@
+"""Pictures of rendered views without a display: rows beside the truth, the contact sheet, a fly-through."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edslam_ti.errors import DataError, EdSlamError
+from edslam_ti.output import atomic_file
+from edslam_ti.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GAP, HEAD, CAPTION = 6, 34, 20  # pixels between panels, above all of them, above each row
+LARGEST_ERROR = 0.25  # brightness at the end of the error's colour scale
+SMOOTHING = 0.1  # seconds, Gaussian width over which the fly-through's path is smoothed
+
+
+# ---------------------------------------------------------------- rows of views
+
+
+@dataclass(frozen=True)
+class PictureRow:
+    """A rendered view and what there is to compare it with."""
+
+    caption: str
+    truth: np.ndarray | None  # [H, W] brightness in [0, 1]
+    render: np.ndarray  # [H, W] brightness; what lies outside [0, 1] is clipped
+    depth: np.ndarray  # [H, W] metres, 0 = nothing drawn
+
+
+def write_contact_sheet(path: Path, rows: Sequence[PictureRow], panel_width: int = 384) -> None:
+    """Write one row per view: truth, render, absolute error and rendered depth.
+
+    Images narrower than `panel_width` pixels are enlarged by a whole number, much wider ones are reduced.
+    """
+    if not rows:
+        raise DataError(f"{path.name}: expected at least one view, got none")
+    shape = rows[0].render.shape
+    for row in rows:
+        for name, image in (("render", row.render), ("truth", row.truth), ("depth", row.depth)):
+            if image is not None and image.shape != shape:
+                raise DataError(f"{name}: expected shape {shape} as the first render's, got {image.shape}")
+    near, far = _depth_range([row.depth for row in rows])
+    h, w = _panel_size(shape, panel_width)
+    panels = [[_resized(panel, h, w) for panel in _panels(row, near, far)] for row in rows]
+    lefts = [GAP + column * (w + GAP) for column in range(4)]
+    tops = [HEAD + k * (CAPTION + h) + CAPTION for k in range(len(rows))]
+    width, height = lefts[-1] + w + GAP, tops[-1] + h + GAP
+    figure = new_figure(width / 100, height / 100, dpi=100, layout="none")
+
+    def write(x: float, y: float, text: str, **style: Any) -> None:  # pixels from the top left
+        figure.text(x / width, 1 - y / height, text, fontsize=9, va="center", **style)
+
+    titles = ("truth", "render", f"error, 0 to {LARGEST_ERROR}", f"depth, {near:.2f} to {far:.2f} m")
+    for column, title in enumerate(titles):
+        write(lefts[column] + (w // 4 + 8 if column > 1 else 0), HEAD / 2, title)
+    for row, top in zip(rows, tops):
+        write(GAP, top - CAPTION / 2, row.caption, fontweight="bold")
+        if row.truth is None:
+            for column in (0, 2):
+                write(lefts[column] + w / 2, top + h / 2, "no truth", ha="center")
+    # Panels are put in after the text is drawn, pixel by pixel: matplotlib would resample them.
+    sheet = _drawn(figure)
+    for row_panels, top in zip(panels, tops):
+        for panel, left in zip(row_panels, lefts):
+            if panel is not None:
+                sheet[top : top + h, left : left + w] = _bytes(panel)
+    scale = np.linspace(0, 1, w // 4)[None].repeat(8, 0)
+    for left, name in ((lefts[2], "magma"), (lefts[3], "viridis")):
+        sheet[HEAD // 2 - 4 : HEAD // 2 + 4, left : left + w // 4] = _bytes(_coloured(scale, name))
+    _write_png(path, sheet)
+
+
+def _panels(row: PictureRow, near: float, far: float) -> list[np.ndarray | None]:  # 4 of [H, W, 3]
+    render = np.clip(row.render, 0, 1)
+    truth = error = None
+    if row.truth is not None:
+        truth = _grey(row.truth)
+        error = _coloured(np.abs(render - row.truth) / LARGEST_ERROR, "magma")
+    return [truth, _grey(render), error, depth_colours(row.depth, near, far)]
+
+
+def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:  # [H, W] -> [H, W, 3]
+    """Return depth (metres) in colours from dark (near) to bright (far), white where there is none."""
+    colours = _coloured((depth - near) / max(far - near, 1e-3), "viridis")
+    colours[depth <= 0] = 1.0
+    return colours
+
+
+def _depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:  # metres
+    known = np.concatenate([d[d > 0] for d in depths])
+    if len(known) == 0:
+        return 0.0, 1.0
+    near, far = np.percentile(known, (1, 99))
+    return float(near), float(far)
+
+
+def _coloured(values: np.ndarray, name: str) -> np.ndarray:  # [H, W] in [0, 1] -> [H, W, 3]
+    from matplotlib import colormaps
+
+    return np.asarray(colormaps[name](np.clip(values, 0, 1))[..., :3])
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:  # in [0, 1] -> uint8
+    return np.rint(255 * image).astype(np.uint8)
+
+
+def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H, W, 3]
+    return np.repeat(image.astype(np.float64)[..., None], 3, axis=-1)
+
+
+def _panel_size(shape: tuple[int, ...], panel_width: int) -> tuple[int, int]:
+    """Return height and width of a panel."""
+    height, width = shape
+    zoom = max(1, round(panel_width / width))
+    if width <= 1.25 * panel_width:
+        return zoom * height, zoom * width
+    return round(height * panel_width / width), panel_width
+
+
+def _resized(panel: np.ndarray | None, height: int, width: int) -> np.ndarray | None:
+    if panel is None or panel.shape[:2] == (height, width):
+        return panel
+    way = cv2.INTER_NEAREST if panel.shape[1] < width else cv2.INTER_AREA
+    return np.asarray(cv2.resize(panel, (width, height), interpolation=way))
+
+
+# ---------------------------------------------------------------- fly-through
+
+
+class NoEncoderError(EdSlamError):
+    """This OpenCV cannot encode video."""
+
+
+def smooth_path(
+    trajectory: Trajectory,
+    fps: float,  # frames per second of the sequence
+    max_frames: int,
+) -> Iterator[np.ndarray]:  # [4, 4]
+    """Yield poses evenly spaced in time: means of the key poses around each, in a Gaussian window."""
+    stamps = trajectory.timestamps
+    count = min(max_frames, max(1, round((stamps[-1] - stamps[0]) * fps)))
+    for t in np.linspace(stamps[0], stamps[-1], count):
+        # A window that shrinks towards the ends keeps its mean at the time in its middle.
+        width = max(min(SMOOTHING, (t - stamps[0]) / 2, (stamps[-1] - t) / 2), 1e-6)
+        near = np.unique(np.clip(np.arange(-8, 9) / 4 * width + t, stamps[0], stamps[-1]))
+        weights = np.exp(-0.5 * ((near - t) / width) ** 2)
+        around = trajectory.resampled(near).poses
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_matrix(around[:, :3, :3]).mean(weights).as_matrix()
+        T[:3, 3] = np.average(around[:, :3, 3], axis=0, weights=weights)
+        yield T
+
+
+def fly_through_frames(
+    views: Iterable[tuple[np.ndarray, np.ndarray]],  # brightness and depth [H, W] of every frame
+) -> Iterator[np.ndarray]:  # [H, 2 W, 3] in [0, 1]
+    """Yield render and depth side by side; the first frame sets the depth's colours."""
+    near = far = 0.0
+    for intensity, depth in views:
+        if far == 0.0 and (depth > 0).any():
+            near, far = _depth_range([depth])
+        yield np.concatenate([_grey(np.clip(intensity, 0, 1)), depth_colours(depth, near, far)], 1)
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write frames ([H, W, 3] RGB in [0, 1]) as MPEG-4; odd edges are cut off, the format has even sizes."""
+    writer = None
+    with atomic_file(path) as temporary:
+        for frame in frames:
+            h, w = (n // 2 * 2 for n in frame.shape[:2])
+            if writer is None:
+                code = cv2.VideoWriter.fourcc(*"mp4v")
+                writer = cv2.VideoWriter(str(temporary), code, fps, (w, h))
+                if not writer.isOpened():
+                    raise NoEncoderError(f"{path.name}: OpenCV cannot write MPEG-4 here; no video is made")
+            writer.write(_bytes(frame[:h, :w, ::-1]))
+        if writer is None:
+            raise DataError(f"{path.name}: expected at least one frame, got none")
+        writer.release()
+
+
+# ---------------------------------------------------------------- matplotlib without global state
+
+
+def new_figure(width: float, height: float, dpi: int = 120, layout: Any = "constrained") -> "Figure":
+    """Return a figure (inches) that belongs to nobody: no pyplot, so no display and no leak."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=dpi, layout=layout)
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure as PNG."""
+    _write_png(path, _drawn(figure))
+
+
+def _drawn(figure: "Figure") -> np.ndarray:  # [H, W, 3] uint8
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3]
+
+
+def _write_png(path: Path, rgb: np.ndarray) -> None:  # [H, W, 3] uint8
+    with atomic_file(path) as temporary:
+        if not cv2.imwrite(str(temporary), np.ascontiguousarray(rgb[..., ::-1])):
+            raise DataError(f"{path}: could not be written; is the disk full?")
