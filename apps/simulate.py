@@ -36,7 +36,7 @@ def simulate(
 
     Args:
         out: folder that receives the recording (replaced when it exists)
-        scene: built-in room (room0, room2, office0, office2, office3) or test scene (wall, corridor)
+        scene: built-in room (room0, room2, office0, office2, office3) or wall, corridor, kitchen, ...
         mesh: textured or vertex-coloured mesh file instead of a room
         mesh_scale: factor from the mesh's unit to metres
         trajectory: camera-to-world path, TUM format; rooms have a path of their own

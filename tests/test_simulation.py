@@ -26,6 +26,7 @@ from edslam_ti.simulation import (
     make_room,
     simulate,
 )
+from edslam_ti.simulation.catalogue import UNSEEN_ROOM_NAMES
 from edslam_ti.simulation.depth_noise import kinect_depth
 from edslam_ti.simulation.renderer import Renderer
 from edslam_ti.simulation.scene import Material, SceneBuilder
@@ -134,7 +135,7 @@ def test_image_warped_by_true_depth_and_pose_matches(office: Room) -> None:
     assert difference(0.0) < 0.7 * min(difference(0.5), difference(-0.5))
 
 
-@pytest.mark.parametrize("name", ROOM_NAMES)
+@pytest.mark.parametrize("name", [*ROOM_NAMES, *UNSEEN_ROOM_NAMES])
 def test_room_is_closed_and_textured(name: str) -> None:
     room = cached_room(name)
     config = SimulationConfig(width=120, height=76)
@@ -143,7 +144,7 @@ def test_room_is_closed_and_textured(name: str) -> None:
     for t in (0.0, 1.3, 2.5):
         render = renderer.render(path.pose(t))
         assert (render.depth > 0).all()
-        assert 0.2 < render.grey.mean() < 0.75
+        assert 0.15 < render.grey.mean() < 0.75
         # Nearly every region has contrast: blocks of 12 x 12 pixels that are flat are rare.
         blocks = np.log(render.grey[:72, :120] + 0.004).reshape(6, 12, 10, 12).swapaxes(1, 2)
         assert (np.ptp(blocks, axis=(2, 3)) > 0.1).mean() > 0.85
@@ -203,7 +204,7 @@ def test_path_is_hand_held_and_clear_of_furniture(name: str) -> None:
         turn = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1))) / 0.02
         assert 0.25 < speed.mean() < 0.6
         assert 0.6 < speed.max() < 1.6
-        slowest = 15 if name in ROOM_NAMES else 8  # little to look at on either side
+        slowest = 8 if name in ("wall", "corridor") else 15  # little to look at on either side
         assert slowest < turn.mean() < 60
         assert 3 * slowest < turn.max() < 200
 
