@@ -8,37 +8,34 @@ import taichi as ti
 
 from kernels.runtime import CHUNK, check_shape, workers
 
-MANY_EVENTS = 300_000  # below this numpy is done before a second core has woken up
+MANY_EVENTS = 1_000_000  # below this numpy is done before a second core has woken up
 
 
 @ti.kernel
-def _newest_timestamps(
+def _newest_events(
     x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
-    t: ti.types.ndarray(ti.f64, ndim=1),  # [N] seconds, sorted
+    polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N], any if not by polarity
     height: ti.i32,
     width: ti.i32,
-    newest: ti.types.ndarray(ti.f64, ndim=1),  # out [workers * H * W] seconds, -inf in
-    num_outside: ti.types.ndarray(ti.i64, ndim=1),  # out [workers] events outside the image
+    num_workers: ti.i32,
+    newest: ti.types.ndarray(ti.i32, ndim=1),  # out [workers * pixels] index of an event, -1 in
+    by_polarity: ti.template(),
 ):
     # Parallel stores to one image race and atomics are slow: each worker has a part of the time and an
-    # image of its own.
-    num_workers = num_outside.shape[0]
-    n = ti.cast(x.shape[0], ti.i64)
+    # image of its own, of indices, because those are half as long as times and need not be read.
+    num_pixels = newest.shape[0] // num_workers
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
-            w = chunk // CHUNK
-            first = w * height * width
-            outside = ti.cast(0, ti.i64)
+            w, n = chunk // CHUNK, ti.cast(x.shape[0], ti.i64)
+            own = w * num_pixels
             for i in range(
                 ti.cast(n * w // num_workers, ti.i32), ti.cast(n * (w + 1) // num_workers, ti.i32)
             ):
-                row, column = ti.cast(y[i], ti.i32), ti.cast(x[i], ti.i32)
-                if 0 <= row < height and 0 <= column < width:
-                    newest[first + row * width + column] = t[i]
-                else:
-                    outside += 1
-            num_outside[w] = outside
+                row = ti.cast(y[i], ti.i32)
+                if ti.static(by_polarity):
+                    row += ti.select(polarity[i] > 0, height, 0)
+                newest[own + row * width + ti.cast(x[i], ti.i32)] = i
 
 
 @ti.kernel
@@ -63,23 +60,40 @@ def _accumulate_polarity(
 def update_last_timestamps(
     x: np.ndarray,  # [N] int16
     y: np.ndarray,  # [N] int16
-    t: np.ndarray,  # [N] float64 seconds, sorted
-    last: np.ndarray,  # [H, W] float64 seconds, changed in place
+    t: np.ndarray,  # [N] float64 seconds, sorted, not before any entry of `last`
+    last: np.ndarray,  # [H, W] float64 seconds, or [2, H, W] by polarity (-1, +1); changed in place
+    polarity: np.ndarray | None = None,  # [N] int8, -1 or +1; needed by polarity only
 ) -> None:
     """Write the time of each pixel's newest event into `last`; start it with -inf."""
     check_shape("y", y, x.shape)
     check_shape("t", t, x.shape)
-    if len(x):
-        if len(x) < MANY_EVENTS:
-            _check_inside(x, y, last.shape)
-            last[y, x] = t  # of several events at a pixel numpy keeps the last
-        else:
-            newest = np.full(workers() * last.size, -np.inf)
-            num_outside = np.zeros(workers(), np.int64)
-            _newest_timestamps(x, y, t, *last.shape, newest, num_outside)
-            if num_outside.any():
-                _check_inside(x, y, last.shape)
-            np.maximum(last, newest.reshape(-1, *last.shape).max(0), out=last)
+    if last.ndim not in (2, 3) or (last.ndim == 3) != (polarity is not None):
+        raise ValueError(
+            f"last: expected shape (H, W), or (2, H, W) with polarities, got {last.shape} "
+            f"{'without' if polarity is None else 'with'} polarities"
+        )
+    if polarity is not None:
+        check_shape("polarity", polarity, x.shape)
+        check_shape("last", last, (2, None, None))
+    if len(x) == 0:
+        return
+    if not last.flags.c_contiguous:
+        raise ValueError("last: expected a contiguous array; pass a copy and assign it back")
+    height, width = last.shape[-2:]
+    _check_inside(x, y, (height, width))
+    flat = last.reshape(-1)
+    if len(x) < MANY_EVENTS:
+        pixels = np.multiply(y, width, dtype=np.intp)
+        pixels += x
+        if polarity is not None:
+            pixels += (polarity > 0) * (height * width)
+        flat[pixels] = t  # of several events at a pixel numpy keeps the last
+    else:
+        newest = np.full(workers() * flat.size, -1, np.int32)
+        signs = np.empty(0, np.int8) if polarity is None else polarity
+        _newest_events(x, y, signs, height, width, workers(), newest, polarity is not None)
+        event = newest.reshape(workers(), -1).max(0)
+        np.copyto(flat, t.take(event, mode="clip"), where=event >= 0)
 
 
 def time_surface(
@@ -114,7 +128,8 @@ def accumulate_polarity(
 def _check_inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> None:
     """Kernels do not check bounds, so this does."""
     height, width = shape
-    if x.min() < 0 or y.min() < 0 or x.max() >= width or y.max() >= height:
+    # As unsigned numbers negative ones are large: one comparison for both bounds.
+    if x.view(np.uint16).max() >= width or y.view(np.uint16).max() >= height:
         raise ValueError(
             f"events: expected 0 <= x < {width} and 0 <= y < {height}, got x {x.min()} to {x.max()}, "
             f"y {y.min()} to {y.max()}"

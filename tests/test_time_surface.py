@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import kernels
 from kernels import reference
 from kernels.time_surface import MANY_EVENTS, accumulate_polarity, time_surface, update_last_timestamps
 
@@ -77,3 +78,40 @@ def test_large_batches_match_the_twin_and_events_outside_change_nothing() -> Non
     with pytest.raises(ValueError, match="0 <= y < 30"):
         update_last_timestamps(x, y, t + 1, last)
     assert np.array_equal(last, before)
+
+
+@pytest.mark.parametrize("n", [500, MANY_EVENTS + 3])
+def test_polarities_have_surfaces_of_their_own(n: int) -> None:
+    x, y, t, polarity = make_events(n, 4)
+    last = np.full((2, *SHAPE), -np.inf)
+    update_last_timestamps(x, y, t, last, polarity)
+    for k, sign in enumerate((-1, 1)):
+        part = polarity == sign
+        expected = reference.last_timestamps(*(torch.from_numpy(a[part]) for a in (x, y, t)), SHAPE)
+        assert np.array_equal(last[k], expected.numpy())
+
+
+def test_surfaces_by_polarity_need_polarities() -> None:
+    x, y, t, polarity = make_events(10, 5)
+    with pytest.raises(ValueError, match="without polarities"):
+        update_last_timestamps(x, y, t, np.full((2, *SHAPE), -np.inf))
+    with pytest.raises(ValueError, match="with polarities"):
+        update_last_timestamps(x, y, t, np.full(SHAPE, -np.inf), polarity)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_any_number_of_threads_keeps_the_newest_event(threads: int) -> None:
+    x, y, t, _ = make_events(MANY_EVENTS + 2, 6)
+    last = np.full(SHAPE, -np.inf)
+    kernels.init("cpu", threads=threads)
+    update_last_timestamps(x, y, t, last)
+    kernels.init("cpu", threads=2)
+    expected = reference.last_timestamps(*(torch.from_numpy(a) for a in (x, y, t)), SHAPE)
+    assert np.array_equal(last, expected.numpy())
+
+
+def test_negative_pixels_are_refused() -> None:
+    with pytest.raises(ValueError, match="got x -1 to -1"):
+        update_last_timestamps(
+            np.array([-1], np.int16), np.array([0], np.int16), np.zeros(1), np.zeros(SHAPE)
+        )
