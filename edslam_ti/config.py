@@ -42,6 +42,8 @@ class TrackingConfig(Stage):
     """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
     references: Literal["previous", "keyframe", "both"] = "keyframe"
     """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
+    directions: Literal["both", "forward"] = "both"
+    """Patches of the reference seen in the new frame (forward), and also the other way round (Eq. 5)."""
     surface_sigma: float = Field(0.15, gt=0)
     """Standard deviation of a time-surface residual."""
     depth_weight: float = Field(3.0, ge=0)

@@ -216,19 +216,23 @@ class BidirectionalPatchTracker:
     def _problem(
         self, current: _Reference, references: list[tuple[_Reference, np.ndarray]], level: int
     ) -> "_Problem":
-        """Return Eq. 5 over all references, both directions: source <- target and target <- source."""
+        """Return Eq. 5 over all references, in both directions unless the settings or the depth rule one out.
+
+        The new frame's patches can be warped only where it has depth.
+        """
+        is_bidirectional = self._config.directions == "both" and current.frame.depth is not None
         now = current.frame.level(level)
         directions: list[Direction] = []
         for view, (reference, _) in enumerate(references, start=1):
             model = self._model if reference.has_surface and current.has_surface else self._depth_only
             directions.append(Direction(reference.points[level], 0, model))
-            if current.frame.depth is not None:
+            if is_bidirectional:
                 directions.append(Direction(current.points[level], view, model))
         views = [now, *(reference.frame.level(level) for reference, _ in references)]
         alignment = Alignment(
             directions, np.stack([view.surface_and_depth for view in views]), now.camera.intrinsics
         )
-        return _Problem(alignment, [T for _, T in references], current.frame.depth is not None)
+        return _Problem(alignment, [T for _, T in references], is_bidirectional)
 
     def _with_patches(self, frame: Frame) -> _Reference:
         """Draw patches where the time surface exceeds its threshold and depth is known.

@@ -39,6 +39,15 @@ def test_event_surfaces_alone_are_tracked_to_a_centimetre(
     assert ate_cm(slam, tiny_sequence) < 1.0  # 0.33 cm was measured
 
 
+def test_one_direction_is_enough_in_a_small_room_and_differs(
+    run: Slam, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    forward = tracked(tiny_sequence, tiny_samples, settings(tracking={"directions": "forward"}))
+    assert all(result.converged for result in forward.results)
+    assert position_errors(forward, tiny_sequence).max() < 0.006  # unaligned; 0.0033 m was measured
+    assert not np.array_equal(forward.trajectory.poses, run.trajectory.poses)
+
+
 def test_quality_is_one_at_the_first_frame_and_a_fraction_after(run: Slam) -> None:
     qualities = [result.quality for result in run.results]
     assert qualities[0] == 1

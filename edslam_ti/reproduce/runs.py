@@ -160,6 +160,7 @@ def run_all(
                     with atomic_file(file) as temporary:
                         temporary.write_text(json.dumps(result, indent=1) + "\n")
                     console.print(describe(result), highlight=False, markup=False, soft_wrap=True)
+                    console.file.flush()
                 results.append(result)
                 bar.advance(task)
             if not keep_recordings:
