@@ -82,12 +82,8 @@ class MappingConfig(Stage):
     """False: track only, build no map."""
     iterations: int = Field(5, ge=0)
     """Optimisation steps after each frame."""
-    initial_iterations: int = Field(50, ge=0)
-    """Steps after the first keyframe has seen some motion."""
     final_iterations: int = Field(800, ge=0)
     """Steps over all keyframes after the last frame."""
-    reduced_share: float = Field(0.5, ge=0, le=1)
-    """Share of the steps that work on images of half the size, at about two thirds of the cost."""
     pixel_stride: int = Field(2, ge=1)
     """One new Gaussian for every stride x stride pixels that need one."""
     min_visibility: float = Field(0.8, gt=0, lt=1)
@@ -100,17 +96,16 @@ class MappingConfig(Stage):
     """Opacity of a new Gaussian."""
     min_opacity: float = Field(0.05, ge=0, lt=1)
     """Gaussians that have become fainter are pruned."""
-    intervals: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-    """Lengths of the event intervals of Eq. 10-11 in seconds, drawn at random: short ones give detail,
-    long ones tie the brightness of distant surfaces together."""
-    bins_per_chunk: int = Field(5, ge=1)
-    """Times within a chunk at which an interval may begin or end."""
+    stretch: float = Field(3.0, gt=0)
+    """Seconds of events that count from one start image; then a new one, lest errors pile up."""
+    solved_views: int = Field(24, ge=3)
+    """At most so many frames of a stretch are compared when its start image is solved."""
+    max_views: int = Field(200, ge=10)
+    """At most so many frames are kept to optimise the map for; older ones are thinned out."""
     event_weight: float = Field(1.0, ge=0)
-    """lambda_event of Eq. 16; our event loss is divided by its mean measured square (paper: 0.7)."""
-    depth_weight: float = Field(1.0, ge=0)
+    """lambda_event of Eq. 16 (paper: 0.7)."""
+    depth_weight: float = Field(0.25, ge=0)
     """lambda_d of Eq. 16 (paper: 0.05)."""
-    depth_every: int = Field(4, ge=1)
-    """The depth loss (Eq. 15) is added at every n-th step."""
     scale_weight: float = Field(0.01, ge=0)
     """lambda_reg of Eq. 16 (paper: 0.25)."""
     max_scale_ratio: float = Field(10.0, ge=1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edslam_ti.config import KeyframeConfig
-from edslam_ti.frame import Frame
+from edslam_ti.events import Events
 from kernels.time_surface import accumulate_polarity
 
 
@@ -16,7 +16,6 @@ class Keyframe:
     index: int  # of the frame in the trajectory
     timestamp: float  # seconds
     depth: np.ndarray  # [H, W] float32 metres, 0 = missing
-    reduced_depth: np.ndarray  # [H / 2, W / 2]
 
 
 def is_keyframe(
@@ -31,49 +30,57 @@ def is_keyframe(
 
 
 class EventArchive:
-    """Accumulated polarity between any two of its times: the measured side of Eq. 11, ready to use.
+    """What events say has changed at every pixel since a beginning, at the times of frames (Eq. 11).
 
-    Of every chunk it keeps the sum of polarities up to its start; of chunks in the window also the
-    sums at a few times inside. `forget_details` drops the latter, so that memory is bounded by the
-    keyframes and one image per chunk, not by the number of events.
+    Between two events a pixel's brightness lies within a threshold of the last event's level, and on
+    average 0.2 thresholds further in the direction of the last event and of the next one each (measured on
+    simulated rooms; without it, contrast comes out too small).
     """
 
-    def __init__(self, shape: tuple[int, int], bins_per_chunk: int) -> None:
-        self._bins = bins_per_chunk
-        self._total = np.zeros(shape, np.int16)  # sum of polarities so far
-        self._before: list[np.ndarray] = []  # [H, W] int16 of each chunk: total at its start
-        self._inside: list[np.ndarray | None] = []  # [bins, H, W] int16: running sums within the chunk
-        self.edges: list[np.ndarray] = []  # [bins + 1] seconds of each chunk
+    STEPS = 10  # units of the stored images in one threshold
+    LEAN = 2  # in these units: 0.2 thresholds
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._level = np.zeros(shape, np.int16)  # events since the beginning, by polarity
+        self._last = np.zeros(shape, np.int16)  # polarity of the last event
+        self._last_frame = np.zeros(shape, np.int32)  # frames up to this one know their next event
+        self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
 
     def __len__(self) -> int:
-        return len(self.edges)
+        return len(self._images)
 
-    def append(self, frame: Frame) -> None:
-        """Add the event chunk that ends at `frame`."""
-        edges = np.linspace(frame.previous_timestamp, frame.timestamp, self._bins + 1)
-        events = frame.events
-        first = np.searchsorted(events.t, edges)
-        sums = accumulate_polarity(events.x, events.y, events.polarity, first, self._total.shape)
-        running = np.cumsum(sums, axis=0, dtype=np.int16)
-        self._before.append(self._total)
-        self._inside.append(running)
-        self.edges.append(edges)
-        self._total = self._total + running[-1]
+    @property
+    def frames(self) -> list[int]:
+        """Frames whose images are kept, in order of time."""
+        return list(self._images)
 
-    def forget_details(self, keep: set[int]) -> None:
-        """Keep times inside chunks only for those in `keep`."""
-        for chunk in range(len(self)):
-            if chunk not in keep:
-                self._inside[chunk] = None
+    def append(self, events: Events, index: int, is_kept: bool) -> None:
+        """Add the events up to frame `index`; keep the change up to it, if wanted."""
+        shape = self._level.shape
+        pixel = events.y.astype(np.int64) * shape[1] + events.x
+        next_polarity = np.zeros(shape, np.int16)
+        next_polarity.ravel()[pixel[::-1]] = events.polarity[::-1]  # of repeated pixels the first one stays
+        has_fired = next_polarity != 0
+        for frame, image in self._images.items():
+            image += self.LEAN * next_polarity * (self._last_frame <= frame)
+        self._level += accumulate_polarity(
+            events.x, events.y, events.polarity, np.array([0, len(events)]), shape
+        )[0]
+        self._last.ravel()[pixel] = events.polarity  # of repeated pixels the last one stays
+        self._last_frame[has_fired] = index
+        if is_kept:
+            self._images[index] = self.STEPS * self._level + self.LEAN * self._last
 
-    def times(self, chunk: int) -> np.ndarray:
-        """Return the times of a chunk at which sums are known, its start included, its end not."""
-        return self.edges[chunk][:-1] if self._inside[chunk] is not None else self.edges[chunk][:1]
+    def change(self, index: int) -> np.ndarray:  # [H, W] float32
+        """Return the change from the beginning to a kept frame, in contrast thresholds."""
+        return self._images[index].astype(np.float32) / self.STEPS
 
-    def sum_before(self, chunk: int, bin_index: int) -> np.ndarray:  # [H, W] int16
-        """Return the sum of polarities from the beginning to the given edge of a chunk."""
-        if bin_index == 0:
-            return self._before[chunk]
-        inside = self._inside[chunk]
-        assert inside is not None
-        return self._before[chunk] + inside[bin_index - 1]
+    def forget(self, index: int) -> None:
+        """Give up a frame's image."""
+        del self._images[index]
+
+    def begin_again(self) -> np.ndarray:  # [H, W] float32
+        """Count from here on anew; return what has changed up to here. Kept images stay as they are."""
+        change = self._level + 0.1 * self.LEAN * self._last
+        self._level[:] = 0
+        return change.astype(np.float32)

@@ -21,7 +21,10 @@ RANKS: list[list[str]] = [
         "edslam_ti.losses",
         "edslam_ti.brightness",
     ],
-    ["edslam_ti.frame", "edslam_ti.tracking", "edslam_ti.keyframes", "edslam_ti.mapping"],
+    [
+        *("edslam_ti.frame", "edslam_ti.tracking", "edslam_ti.keyframes", "edslam_ti.event_images"),
+        "edslam_ti.mapping",
+    ],
     ["edslam_ti.slam"],
     [
         *("edslam_ti.baselines.*", "edslam_ti.evaluation", "edslam_ti.surface_errors", "edslam_ti.export"),
@@ -45,12 +48,12 @@ LIBRARIES: dict[str, list[str]] = {
     ],
     "yaml": ["edslam_ti.config"],
     "scipy": [
-        *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.brightness", "edslam_ti.mapping"),
+        *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.brightness"),
         "edslam_ti.pictures",
     ],
     "cv2": [
-        *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.mapping"),
-        "edslam_ti.pictures",
+        *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.pictures"),
+        *("edslam_ti.brightness", "edslam_ti.event_images"),
     ],
     "OpenEXR": ["edslam_ti.datasets.*"],
     "platformdirs": ["edslam_ti.datasets.*"],

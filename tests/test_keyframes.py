@@ -1,4 +1,4 @@
-"""Which frames become keyframes, and the archive of events between any two times."""
+"""Which frames become keyframes, and the archive of what events have changed."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,10 @@ import pytest
 from edslam_ti.camera import Camera
 from edslam_ti.config import KeyframeConfig
 from edslam_ti.events import Events
-from edslam_ti.frame import Frame
 from edslam_ti.keyframes import EventArchive, is_keyframe
 
 CAMERA = Camera(12, 9, 10.0, 10.0, 5.5, 4.0)
-BINS = 5
+TIMES = (0.1, 0.15, 0.33, 0.4)  # of the frames that end chunks of different lengths
 
 
 @pytest.mark.parametrize(
@@ -45,53 +44,55 @@ def events() -> Events:
 
 @pytest.fixture
 def archive(events: Events) -> EventArchive:
-    """Four chunks of different lengths from 0 to 0.4 s."""
-    result = EventArchive(CAMERA.shape, BINS)
-    surface = np.zeros(CAMERA.shape, np.float32)
-    for start, end in ((0.0, 0.1), (0.1, 0.15), (0.15, 0.33), (0.33, 0.4)):
-        result.append(Frame(end, start, events.between(start, end), CAMERA, surface, None, None))
+    """Four frames; the third is not kept."""
+    result = EventArchive(CAMERA.shape)
+    for k, (start, end) in enumerate(zip((0.0, *TIMES), TIMES)):
+        result.append(events.between(start, end), k, is_kept=k != 2)
     return result
 
 
-def counted(events: Events, start: float, end: float) -> np.ndarray:
-    """Return the sum of polarities, event by event."""
-    total = np.zeros(CAMERA.shape, int)
-    part = events.between(start, end)
-    np.add.at(total, (part.y, part.x), part.polarity)
+def expected_change(events: Events, time: float, end: float) -> np.ndarray:
+    """Return polarities up to a time, and 0.2 of the last event's and the next one's, pixel by pixel."""
+    total = np.zeros(CAMERA.shape)
+    for y, x in np.ndindex(CAMERA.shape):
+        here = (events.y == y) & (events.x == x) & (events.t < end)
+        before, after = events.polarity[here & (events.t < time)], events.polarity[here & (events.t >= time)]
+        total[y, x] = before.sum() + 0.2 * before[-1:].sum() + 0.2 * after[:1].sum()
     return total
 
 
-def test_sum_between_any_two_edges_is_the_count_of_the_events_between(
+def test_change_counts_events_and_leans_towards_the_last_and_the_next(
     archive: EventArchive, events: Events
 ) -> None:
-    random = np.random.default_rng(1)
-    edges = [(chunk, b) for chunk in range(len(archive)) for b in range(BINS)]
-    assert len(edges) == 20
-    for _ in range(60):
-        a, b = sorted(random.choice(len(edges), 2, replace=False))
-        start, end = (archive.edges[chunk][k] for chunk, k in (edges[a], edges[b]))
-        assert start < end
-        sums = archive.sum_before(*edges[b]) - archive.sum_before(*edges[a])
-        assert (sums == counted(events, start, end)).all()
+    assert archive.frames == [0, 1, 3]
+    for frame in archive.frames:
+        expected = expected_change(events, TIMES[frame], end=TIMES[-1])
+        np.testing.assert_allclose(archive.change(frame), expected, atol=1e-6)
 
 
-def test_forgotten_chunks_keep_their_starts(archive: EventArchive, events: Events) -> None:
-    archive.forget_details(keep={1, 7})
-    assert [len(archive.times(chunk)) for chunk in range(4)] == [1, BINS, 1, 1]
-    assert [archive.times(chunk)[0] for chunk in range(4)] == pytest.approx([0, 0.1, 0.15, 0.33])
-    sums = archive.sum_before(3, 0) - archive.sum_before(1, 2)
-    assert (sums == counted(events, 0.12, 0.33)).all()
+def test_next_event_may_come_many_frames_later() -> None:
+    archive = EventArchive(CAMERA.shape)
+    one = Events(np.array([3], np.int16), np.array([2], np.int16), np.array([0.5]), np.array([-1], np.int8))
+    for k in range(4):
+        archive.append(one if k == 3 else Events.empty(), k, is_kept=True)
+    assert [archive.change(k)[2, 3] for k in range(4)] == pytest.approx([-0.2, -0.2, -0.2, -1.2])
 
 
-def test_chunk_without_events_adds_nothing(archive: EventArchive) -> None:
-    surface = np.zeros(CAMERA.shape, np.float32)
-    archive.append(Frame(0.5, 0.4, Events.empty(), CAMERA, surface, None, None))
-    archive.append(Frame(0.6, 0.5, Events.empty(), CAMERA, surface, None, None))
-    assert (archive.sum_before(5, 3) == archive.sum_before(4, 0)).all()
+def test_counting_begins_again_where_it_ended(archive: EventArchive, events: Events) -> None:
+    before = [archive.change(k) for k in archive.frames]
+    ended = archive.begin_again()
+    np.testing.assert_allclose(ended, archive.change(3), atol=1e-6)  # no next event is known yet
+    later = Events(events.x[:50], events.y[:50], events.t[:50] + 1, events.polarity[:50])
+    archive.append(later, 4, is_kept=True)
+    nothing_before = EventArchive(CAMERA.shape)
+    nothing_before.append(later, 0, is_kept=True)
+    fired = np.zeros(CAMERA.shape, bool)
+    fired[later.y, later.x] = True
+    np.testing.assert_allclose(archive.change(4)[fired], nothing_before.change(0)[fired], atol=1e-6)
+    for k, image in zip((0, 1, 3), before):  # earlier frames still learn their next event
+        assert np.abs(archive.change(k) - image).max() <= 0.2 + 1e-6
 
 
-def test_memory_is_one_image_a_forgotten_chunk(archive: EventArchive) -> None:
-    before = archive.sum_before(2, 0)
-    archive.forget_details(keep=set())
-    assert archive.sum_before(2, 0) is before
-    assert before.dtype == np.int16
+def test_forgotten_frames_are_gone(archive: EventArchive) -> None:
+    archive.forget(1)
+    assert archive.frames == [0, 3]

@@ -9,11 +9,11 @@ from sequences import make_slam, settings
 
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.evaluation import evaluate_images
-from edslam_ti.mapping import GaussianMapper, PoseRefiner, block_means, densify_mask
+from edslam_ti.mapping import GaussianMapper, PoseRefiner, densify_mask
 from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
 
-FEW = {"iterations": 1, "initial_iterations": 3, "final_iterations": 3}
+FEW = {"iterations": 1, "final_iterations": 3}
 
 
 def mapped(
@@ -50,10 +50,10 @@ def test_mapping_raises_the_psnr_of_held_out_views(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     held_out = {3, 8, 12}
-    untouched: dict[str, Any] = {"iterations": 0, "initial_iterations": 0, "final_iterations": 0}
+    untouched: dict[str, Any] = {"iterations": 0, "final_iterations": 0}
     slam, blank = mapped(tiny_sequence, tiny_samples, held_out, finish=False, **untouched)
     before = corrected_psnr(blank, slam, tiny_samples, sorted(held_out))
-    steps = {"iterations": 8, "initial_iterations": 40, "final_iterations": 50}
+    steps = {"iterations": 8, "final_iterations": 100}
     slam, mapper = mapped(tiny_sequence, tiny_samples, held_out, **steps)
     after = corrected_psnr(mapper, slam, tiny_samples, sorted(held_out))
     assert after > before + 5  # 13 dB to 22 dB was measured
@@ -95,22 +95,13 @@ def test_images_are_never_used(tiny_sequence: EventDepthSequence, tiny_samples: 
     assert (clean.gaussians.raw["logit_colors"] == other.gaussians.raw["logit_colors"]).all()
 
 
-def test_intervals_never_begin_or_end_near_held_out_times(
+def test_images_from_events_exist_at_every_frame_but_held_out_ones(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
-    held_out = {3, 8, 12}
-    slam, mapper = mapped(tiny_sequence, tiny_samples, held_out, finish=False)
-    forbidden = slam.trajectory.timestamps[sorted(held_out)]
-    lengths = []
-    for _ in range(500):
-        edges = mapper._draw_interval(newest_share=0.4)
-        start, end = (mapper._archive.edges[chunk][b] for chunk, b in edges)
-        for t in (start, end):
-            assert np.abs(t - forbidden).min() > 0.007  # 15 % of a chunk of 50 ms
-        lengths.append(end - start)
-    assert min(lengths) > 0
-    assert min(lengths) < 0.03  # short ones for detail
-    assert max(lengths) > 0.4  # long ones for large surfaces
+    _, mapper = mapped(tiny_sequence, tiny_samples, held_out={3, 8, 12}, finish=False)
+    assert mapper.images.frames == [k for k in range(len(tiny_samples)) if k not in (3, 8, 12)]
+    drawn = {mapper._draw_recent() for _ in range(200)} | {mapper._draw_any() for _ in range(20)}
+    assert drawn == set(mapper.images.frames)
 
 
 # --- growing and pruning ---
@@ -137,7 +128,7 @@ def test_mapped_pixels_get_no_second_gaussians(
 ) -> None:
     _, first = mapped(tiny_sequence, tiny_samples[:1])
     assert first.num_gaussians == 120 * 80 / 4
-    _, all_of_them = mapped(tiny_sequence, tiny_samples, iterations=0, initial_iterations=0)
+    _, all_of_them = mapped(tiny_sequence, tiny_samples, iterations=0)
     # 14 views of nearly the same walls: what is new is the rim and behind edges.
     assert first.num_gaussians < all_of_them.num_gaussians < 2 * first.num_gaussians
 
@@ -242,9 +233,3 @@ def test_depth_image_of_zeros_and_frames_without_depth_are_passed_over(
     _, mapper = mapped(tiny_sequence, samples)
     assert mapper.num_gaussians >= 120 * 80 / 4
     assert np.isfinite(mapper.loss)
-
-
-def test_block_means_cut_odd_edges() -> None:
-    image = np.arange(15, dtype=np.float32).reshape(3, 5)
-    np.testing.assert_array_equal(block_means(image, 2), [[3.0, 5.0]])
-    assert block_means(image, 1) is image

@@ -28,7 +28,7 @@ from edslam_ti.slam import Slam
 from edslam_ti.tracking import TrackingResult
 from edslam_ti.trajectory import read_tum
 
-FEW = {"iterations": 1, "initial_iterations": 10, "final_iterations": 10}
+FEW = {"iterations": 1, "final_iterations": 10}
 ARTEFACTS = {
     *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "trajectory.png"),
     *("map.ply", "mesh.ply", "points.ply", "flythrough.mp4"),

@@ -69,7 +69,7 @@ def test_mapping_while_tracking_keeps_the_tracked_poses(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     # The young map's errors must not pull poses along: the loop alone gives what tracking alone gives.
-    few = {"iterations": 1, "initial_iterations": 2}
+    few = {"iterations": 1}
     poses = []
     for enabled in (True, False):
         slam = make_slam(tiny_sequence, tiny_samples, settings(mapping=few | {"enabled": enabled}))

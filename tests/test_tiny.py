@@ -80,9 +80,7 @@ def test_gaussians_from_one_depth_image_render_it_back(
 def test_mapping_makes_the_event_loss_fall(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
-    config = settings(
-        poses="truth", mapping={"iterations": 0, "initial_iterations": 0, "final_iterations": 60}
-    )
+    config = settings(poses="truth", mapping={"iterations": 0, "final_iterations": 60})
     slam = make_slam(tiny_sequence, tiny_samples, config)
     for sample in tiny_samples[:8]:
         slam.process(sample)

@@ -1,0 +1,139 @@
+"""Images from events: the start image of a stretch of a few seconds, and what has changed since (Eq. 11)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edslam_ti.brightness import EventView, block_means, solve_start_image
+from edslam_ti.camera import Camera
+from edslam_ti.config import MappingConfig
+from edslam_ti.frame import Frame
+from edslam_ti.keyframes import EventArchive
+from edslam_ti.trajectory import Trajectory
+
+MIN_VIEWS = 3  # frames needed before a start image can be solved
+QUICK = {4: 60}  # iterations of the solution by reduction of the images, during the run
+THOROUGH = {4: 100, 2: 50}  # the same at the end
+GIVEN_VIEWS = 6  # frames of earlier stretches that a start image is tied to
+DETAIL_SIGMA = 4.0  # px; smaller details of the start image come from the map
+DETAIL_RATE = 0.1  # share of a view's difference that they take over
+
+
+@dataclass
+class _Stretch:
+    """Frames whose changes count from one start image."""
+
+    first: int  # frame
+    start: np.ndarray  # [H, W] float32 log brightness
+
+
+class EventImages:
+    """Log brightness at the times of frames, as events, depth and poses tell it.
+
+    The start image is solved for every stretch, so that errors of the events (noise, a wrong threshold)
+    do not pile up, and tied to frames of earlier stretches. The absolute level is unknown.
+    """
+
+    def __init__(self, camera: Camera, contrast_threshold: float, config: MappingConfig) -> None:
+        self.is_solved = False
+        self._camera = camera
+        self._contrast_threshold = contrast_threshold
+        self._config = config
+        self._archive = EventArchive(camera.shape)
+        self._depths: dict[int, np.ndarray | None] = {}
+        self._stretches: list[_Stretch] = []
+        self._started = -np.inf  # time of the current stretch's first frame
+
+    @property
+    def frames(self) -> list[int]:
+        """Frames that have an image, in order of time."""
+        return self._archive.frames
+
+    def depth(self, index: int) -> np.ndarray | None:
+        """Return a frame's measured depth [H, W] in metres, 0 = missing."""
+        return self._depths[index]
+
+    def append(self, frame: Frame, index: int) -> None:
+        """Add a frame's events, and its image unless the frame is held out."""
+        self._archive.append(frame.events, index, is_kept=not frame.is_held_out)
+        if not frame.is_held_out:
+            self._depths[index] = frame.depth
+        if not self._stretches:
+            self._archive.begin_again()
+            level = np.float32(np.log(self._config.background))
+            self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
+        elif frame.timestamp - self._started > self._config.stretch:
+            change = self._contrast_threshold * self._archive.begin_again()
+            self._begin(index + 1, frame.timestamp, self._stretches[-1].start + change)
+
+    def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
+        """Return the image at a frame."""
+        return self._stretch(index).start + self._change(index)
+
+    def solve(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
+        """Solve the newest start image (thorough: all of them); return whether there was enough to do so."""
+        stretches = self._stretches if is_thorough else self._stretches[-1:]
+        iterations = THOROUGH if is_thorough else QUICK
+        for stretch in stretches:
+            own = [k for k in self.frames if self._stretch(k) is stretch]
+            if len(own) < MIN_VIEWS:
+                continue
+            other = [k for k in self.frames if k < own[0]] if self.is_solved else []
+            chosen = _evenly(own, self._config.solved_views)
+            given = other[-GIVEN_VIEWS:]
+            views = [self._view(k, trajectory, is_relative=k in chosen) for k in given + chosen]
+            solved = solve_start_image(views, self._camera, stretch.start, iterations)
+            if not given:  # nothing says what the level is: let it be as it was
+                change = (solved.log_brightness - stretch.start)[solved.is_observed]
+                solved.log_brightness[:] -= np.median(change) if len(change) else np.float32(0)
+            stretch.start = solved.log_brightness
+            self.is_solved = True
+        return self.is_solved
+
+    def take_over_details(self, index: int, difference: np.ndarray) -> None:
+        """Move details of a start image towards the map's, which has seen them from many sides.
+
+        `difference` [H, W]: log brightness of the map less the image at the frame.
+        """
+        details = difference - cv2.GaussianBlur(difference, (0, 0), DETAIL_SIGMA)
+        stretch = self._stretch(index)
+        stretch.start = stretch.start + DETAIL_RATE * details
+
+    def set_white(self, brightness: float) -> float:
+        """Shift all images so that the brightest percent is at `brightness`; return the shift in log."""
+        small = [block_means(self.log_brightness(k), 4) for k in self.frames]
+        shift = float(np.log(brightness + self._config.log_epsilon) - np.percentile(small, 99))
+        for stretch in self._stretches:
+            stretch.start = stretch.start + np.float32(shift)
+        return shift
+
+    def thin_out(self, keep: set[int]) -> None:
+        """Forget every other of the older frames beyond the largest number kept, but none of `keep`."""
+        frames = self.frames
+        if len(frames) > self._config.max_views:
+            for k in frames[1 : len(frames) // 2 : 2]:
+                if k not in keep:
+                    self._archive.forget(k)
+                    del self._depths[k]
+
+    def _begin(self, first: int, time: float, start: np.ndarray) -> None:
+        self._stretches.append(_Stretch(first, start.astype(np.float32)))
+        self._started = time
+
+    def _stretch(self, index: int) -> _Stretch:
+        return next(s for s in reversed(self._stretches) if s.first <= index)
+
+    def _change(self, index: int) -> np.ndarray:
+        return np.float32(self._contrast_threshold) * self._archive.change(index)
+
+    def _view(self, index: int, trajectory: Trajectory, is_relative: bool) -> EventView:
+        change = self._change(index) if is_relative else self.log_brightness(index)
+        return EventView(change, self._depths[index], trajectory.pose(index), is_relative)
+
+
+def _evenly(frames: list[int], most: int) -> list[int]:
+    """Return at most `most` of the frames, spread evenly, the last one among them."""
+    if len(frames) <= most:
+        return frames
+    return [frames[int(k)] for k in np.linspace(0, len(frames) - 1, most)]
