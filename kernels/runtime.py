@@ -30,11 +30,12 @@ ASTTransformerContext.get_pos_info = _place_in_source
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
 
 
-def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool = False) -> None:
+def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool | None = None) -> None:
     """Start Taichi on "cpu" or "cuda"; "f64" makes the same kernels run in double precision.
 
-    `threads` is the number of CPU workers. `debug` checks array bounds (slow). Calling it again
-    restarts Taichi. Raises RuntimeError when the device is not there: Taichi itself only warns.
+    `threads` is the number of CPU workers. `debug` checks array bounds (slow); None: as the environment
+    variable TI_DEBUG says. Calling it again restarts Taichi. Raises RuntimeError when the device is not
+    there: Taichi itself only warns.
     """
     if arch not in ("cpu", "cuda"):
         raise ValueError(f"arch: expected 'cpu' or 'cuda', got {arch!r}")
@@ -49,15 +50,16 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
         raise RuntimeError(f"{arch}: Taichi started on {actual} instead; use --device cpu")
 
 
-def _start(arch: str, precision: str, threads: int, debug: bool) -> None:
+def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:
+    checks = {} if debug is None else {"debug": debug}
     ti.init(
         arch=ti.cuda if arch == "cuda" else ti.cpu,
         default_fp=ti.f64 if precision == "f64" else ti.f32,
         cpu_max_num_threads=threads,
         fast_math=False,
         offline_cache=True,
-        debug=debug,
         log_level=ti.ERROR,
+        **checks,
     )
 
 
