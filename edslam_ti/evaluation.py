@@ -124,6 +124,18 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
     )
 
 
+def ate_rmse_cm(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> float | None:
+    """Return the ATE of `TrajectoryErrors` alone, 20 times as fast; None below three common poses."""
+    common = _common_times(estimate, truth)
+    if common.sum() < 3:
+        return None
+    estimated = estimate.poses[common]
+    true = truth.resampled(estimate.timestamps[common]).poses
+    R, t, scale = align(estimated, true, with_scale)
+    distances = np.linalg.norm(scale * estimated[:, :3, 3] @ R.T + t - true[:, :3, 3], axis=1)
+    return 100 * _rms(distances)
+
+
 def align(
     estimated: np.ndarray,  # [P, 4, 4]
     true: np.ndarray,  # [P, 4, 4]

@@ -16,15 +16,16 @@ from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
+from edslam_ti.evaluation import ate_rmse_cm
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping import Mapper
-from edslam_ti.results import Run, errors_of, save
+from edslam_ti.results import Run, save
 from edslam_ti.slam import Slam
 from edslam_ti.tracking import Tracker, TruePoses
 from edslam_ti.visualization import StubViewer, Viewer
 
 DEFAULT_CONTRAST_THRESHOLD = 0.1  # C for data that states none (Sec. IV-A: 0.1 synthetic, 0.2 real)
-ATE_EVERY = 5  # frames between updates of the error on the progress bar
+ATE_EVERY = 10  # frames between updates of the error on the progress bar
 
 
 def run(config: Config, console: Console | None = None) -> Path:
@@ -146,9 +147,9 @@ def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", c
             state.num_events += len(sample.events)
             if not result.converged:
                 state.note(f"frame {k} at {sample.timestamp:.3f} s lost: {result.message}")
-            if k % ATE_EVERY == 0 and k >= ATE_EVERY:
-                errors = errors_of(state)
-                ate = f"  ATE {errors['ate_rmse_cm']:.2f} cm" if errors["ate_rmse_cm"] is not None else ""
+            if k % ATE_EVERY == 0 and state.sequence.truth is not None:
+                error = ate_rmse_cm(slam.trajectory, state.sequence.truth)
+                ate = "" if error is None else f"  ATE {error:.2f} cm"
             hertz = len(slam.results) / (slam.frame_seconds + slam.tracking_seconds + slam.mapping_seconds)
             status = f"{hertz:.1f} Hz"
             if mapper is not None:

@@ -25,6 +25,7 @@ from edslam_ti.evaluation import (
     LinearFit,
     ViewMetrics,
     align_views,
+    ate_rmse_cm,
     depth_l1_cm,
     evaluate_images,
     inceventgs_slice,
@@ -152,16 +153,8 @@ def errors_of(state: Run) -> dict[str, float | None]:
     errors = trajectory_errors(state.slam.trajectory, truth)
     return {
         **{name: _rounded(getattr(errors, name)) for name in names},
-        "ate_frontend_rmse_cm": _compared(state.slam.frontend_trajectory, truth, "ate_rmse_cm"),
+        "ate_frontend_rmse_cm": _rounded(ate_rmse_cm(state.slam.frontend_trajectory, truth)),
     }
-
-
-def _compared(estimate: Trajectory, truth: Trajectory, name: str) -> float | None:
-    """Return one of the trajectory's errors, None where fewer than three poses can be compared."""
-    try:
-        return _rounded(getattr(trajectory_errors(estimate, truth), name))
-    except DataError:
-        return None
 
 
 def _stage_seconds(state: Run, saving: float) -> dict[str, float]:
@@ -384,12 +377,12 @@ def _protocols(state: Run, metrics: dict[str, Any]) -> dict[str, Any]:
     slice_s = None
     if truth is not None and state.sequence.truth is not None and state.sequence.dataset == "event_replica":
         slice_s = inceventgs_slice(state.sequence.scene, state.sequence.truth, trajectory)
-    ate, measured = None, None
+    ate = None
     if truth is not None:
         start, end = slice_s or (-np.inf, np.inf)
         inside = (trajectory.timestamps >= start) & (trajectory.timestamps <= end)
         part = Trajectory(trajectory.timestamps[inside], trajectory.poses[inside])
-        ate = _compared(part, truth, "ate_rmse_sim3_cm")
+        ate = _rounded(ate_rmse_cm(part, truth, with_scale=True))
     if slice_s is None:
         names = {"psnr_corrected_db": "psnr_corrected_db_all", "ssim": "ssim_all", "lpips": "lpips_all"}
         images = {name: metrics[source] for name, source in names.items()}

@@ -11,6 +11,7 @@ from edslam_ti.errors import DataError
 from edslam_ti.evaluation import (
     Lpips,
     align_views,
+    ate_rmse_cm,
     depth_l1_cm,
     evaluate_images,
     fit_event_nerf,
@@ -75,6 +76,16 @@ def test_errors_are_those_of_evo() -> None:
         for name, value in ape.get_all_statistics().items():
             expected = value * (1e4 if name == "sse" else 100)
             assert statistics(errors)[name] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_ate_alone_is_the_same() -> None:
+    truth = helix(300)
+    times = np.linspace(0.5, 2.5, 41) + 0.0003
+    estimate = moved(truth.resampled(times), SOME_MOTION, scale=1.05, noise=0.01)
+    errors = trajectory_errors(estimate, truth)
+    assert ate_rmse_cm(estimate, truth) == pytest.approx(errors.ate_rmse_cm)
+    assert ate_rmse_cm(estimate, truth, with_scale=True) == pytest.approx(errors.ate_rmse_sim3_cm)
+    assert ate_rmse_cm(Trajectory(times[:2], truth.poses[:2]), truth) is None
 
 
 def test_truth_is_interpolated_at_the_estimates_times() -> None:
