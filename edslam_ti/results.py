@@ -32,7 +32,7 @@ from edslam_ti.evaluation import (
     trajectory_errors,
 )
 from edslam_ti.export import fuse_mesh, write_gaussian_ply, write_mesh, write_points
-from edslam_ti.geometry import orthonormalized, rotation_angle_deg
+from edslam_ti.geometry import orthonormalized
 from edslam_ti.mapping import GaussianMapper, Mapper
 from edslam_ti.output import atomic_file, atomic_folder
 from edslam_ti.pictures import (
@@ -45,7 +45,7 @@ from edslam_ti.pictures import (
 )
 from edslam_ti.rendering import View
 from edslam_ti.slam import Slam
-from edslam_ti.surface_errors import TrueSurfaces
+from edslam_ti.surface_errors import mesh_errors
 from edslam_ti.trajectory import Trajectory, write_tum
 from edslam_ti.visualization import plot_trajectory
 from edslam_ti.volume import without_depth_edges
@@ -425,7 +425,7 @@ def _write_map(state: Run, mapper: Mapper, folder: Path) -> Any | None:
         )
 
     def views() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        for T in spread_poses(state.slam.trajectory):
+        for T in state.slam.trajectory.spread(MESH_STEP, MESH_TURN):
             view = mapper.render(state.sequence.camera, T)
             opaque = np.where(view.alpha > MESH_ALPHA, view.depth, 0)
             yield without_depth_edges(opaque), view.intensity, T
@@ -439,30 +439,13 @@ def _write_map(state: Run, mapper: Mapper, folder: Path) -> Any | None:
     return mesh
 
 
-def spread_poses(trajectory: Trajectory) -> list[np.ndarray]:  # [4, 4] each
-    """Return poses of a path, each at least a step or a turn from the one before, and the last."""
-    chosen = [trajectory.pose(0)]
-    for T in trajectory.poses[1:]:
-        motion = np.linalg.inv(chosen[-1]) @ T
-        if np.linalg.norm(motion[:3, 3]) > MESH_STEP or rotation_angle_deg(motion) > MESH_TURN:
-            chosen.append(T)
-    if not np.array_equal(chosen[-1], trajectory.pose(-1)):
-        chosen.append(trajectory.pose(-1))
-    return chosen
-
-
 def _mesh_metrics(state: Run, mesh: Any | None) -> dict[str, float | None]:
     """Return the mesh's errors against the true surfaces that the camera saw; None without them."""
     names = ("mesh_accuracy_cm", "mesh_completion_cm", "mesh_completion_ratio_5cm")
-    truth, sequence = _true_trajectory(state), state.sequence
-    if mesh is None or sequence.surfaces_file is None or truth is None:
+    sequence = state.sequence
+    if mesh is None or sequence.surfaces_file is None or _true_trajectory(state) is None:
         return dict.fromkeys(names)
-    surfaces = TrueSurfaces(sequence.surfaces_file)
-    end = truth.timestamps[-1]
-    beside = [v.T_world_camera for v in sequence.novel_views() if v.timestamp <= end]
-    seen = surfaces.seen_points(sequence.camera, [*spread_poses(truth), *beside])
-    estimate = state.slam.trajectory.resampled(truth.timestamps)
-    errors = surfaces.errors(mesh, seen, align_views(estimate.poses, truth.poses))
+    errors = mesh_errors(mesh, sequence, state.slam.trajectory)
     values = (errors.accuracy_cm, errors.completion_cm, errors.completion_ratio)
     return {name: _rounded(value) for name, value in zip(names, values)}
 

@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.errors import DataError
+from edslam_ti.evaluation import align_views
 from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.trajectory import Trajectory
 
 NUM_SAMPLES = 100_000  # points drawn on a reconstructed mesh
 SPACING = 0.02  # metres; one true point is kept of those that fall into a cube of this size
 COMPLETE_WITHIN = 0.05  # metres
+VIEW_STEP, VIEW_TURN = 0.1, 5.0  # metres, degrees between the views that say what was seen
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,26 @@ class TrueSurfaces:
             100 * float(to_mesh.mean()),
             float((to_mesh <= COMPLETE_WITHIN).mean()),
         )
+
+
+def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -> SurfaceErrors:
+    """Compare a mesh in the frame of an estimated path with what the sequence's camera saw on the way.
+
+    Seen is what lies in a view of the true path at the estimate's times, or of those beside it.
+    """
+    if sequence.surfaces_file is None or sequence.truth is None:
+        raise DataError(
+            f"{sequence.scene}: expected surfaces.ply and true poses to compare a mesh with; simulated "
+            "recordings have both"
+        )
+    inside = [t for t in estimate.timestamps if sequence.truth.covers(t)]
+    if not inside:
+        raise DataError(f"{sequence.scene}: the estimate has no pose at a time that the truth covers")
+    truth = sequence.truth.resampled(np.array(inside))
+    beside = [v.T_world_camera for v in sequence.novel_views() if inside[0] <= v.timestamp <= inside[-1]]
+    surfaces = TrueSurfaces(sequence.surfaces_file)
+    seen = surfaces.seen_points(sequence.camera, [*truth.spread(VIEW_STEP, VIEW_TURN), *beside])
+    return surfaces.errors(mesh, seen, align_views(estimate.resampled(truth.timestamps).poses, truth.poses))
 
 
 def read_triangles(path: Path) -> Any:

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from edslam_ti.errors import DataError
-from edslam_ti.geometry import interpolate
+from edslam_ti.geometry import interpolate, rotation_angle_deg
 from edslam_ti.output import atomic_file
 
 
@@ -85,6 +85,17 @@ class Trajectory:
         k = np.clip(np.searchsorted(stamps, timestamps, side="right") - 1, 0, len(stamps) - 2)
         fraction = torch.from_numpy((timestamps - stamps[k]) / (stamps[k + 1] - stamps[k]))
         return Trajectory(timestamps, interpolate(poses[k], poses[k + 1], fraction).numpy())
+
+    def spread(self, distance: float, angle: float) -> list[np.ndarray]:  # [4, 4] each
+        """Return poses more than `distance` metres or `angle` degrees apart along the path, and the last."""
+        chosen = self._poses[:1]
+        for T in self._poses[1:]:
+            motion = np.linalg.inv(chosen[-1]) @ T
+            if np.linalg.norm(motion[:3, 3]) > distance or rotation_angle_deg(motion) > angle:
+                chosen.append(T)
+        if chosen and chosen[-1] is not self._poses[-1]:
+            chosen.append(self._poses[-1])
+        return chosen
 
     def length(self) -> float:
         """Return the length of the path in metres."""

@@ -3,6 +3,8 @@
 import csv
 import io
 import json
+import re
+import runpy
 import shutil
 import signal
 from collections.abc import Callable
@@ -17,7 +19,7 @@ from rich.console import Console
 from sequences import settings
 
 from edslam_ti import pipeline, results
-from edslam_ti.command_line import launch
+from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
@@ -28,6 +30,7 @@ from edslam_ti.slam import Slam
 from edslam_ti.tracking import TrackingResult
 from edslam_ti.trajectory import read_tum
 
+ROOT = Path(__file__).parents[1]
 FEW = {"iterations": 1, "final_iterations": 10}
 ARTEFACTS = {
     *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "trajectory.png"),
@@ -177,6 +180,22 @@ def test_mesh_is_compared_with_the_true_surfaces(result: Path) -> None:
     assert 0 < metrics["mesh_accuracy_cm"] < 5  # images of 120 x 80 pixels: 4 cm a pixel
     assert 0 < metrics["mesh_completion_cm"] < 10
     assert 0.6 < metrics["mesh_completion_ratio_5cm"] <= 1
+
+
+def test_evaluate_measures_the_same_mesh_from_files(
+    result: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app = runpy.run_path(str(ROOT / "apps" / "evaluate.py"))
+    paths = [str(result / name) for name in ("trajectory_tum.txt", "truth_tum.txt")]
+    app["main"]([*paths, "--mesh", str(result / "mesh.ply"), "--recording", str(tiny_folder)])
+    printed = capsys.readouterr().out.splitlines()[-1]
+    metrics = metrics_of(result)
+    numbers = [float(word) for word in re.findall(r"[0-9.]+", printed)]
+    expected = [metrics["mesh_accuracy_cm"], metrics["mesh_completion_cm"]]
+    assert numbers[:2] == pytest.approx(expected, abs=0.01)  # files hold fewer digits
+    assert numbers[2] == pytest.approx(100 * metrics["mesh_completion_ratio_5cm"], abs=0.1)
+    with pytest.raises(UsageError, match="expected both or neither"):
+        app["main"]([*paths, "--mesh", str(result / "mesh.ply")])
 
 
 def test_fly_through_is_a_video_of_render_and_depth(result: Path) -> None:

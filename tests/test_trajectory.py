@@ -143,3 +143,16 @@ def test_absent_and_binary_tum_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "binary.txt").write_bytes(bytes(range(128, 256)))
     with pytest.raises(DataError, match=r"binary\.txt"):
         read_tum(tmp_path / "binary.txt")
+
+
+def test_spread_poses_are_apart_in_place_or_direction() -> None:
+    poses = np.tile(np.eye(4), (31, 1, 1))
+    poses[:11, 0, 3] = 0.03 * np.arange(11)  # 30 cm along x,
+    poses[11:, 0, 3] = 0.3
+    angles = np.radians(np.maximum(np.arange(31) - 10, 0))  # then 20 degrees on the spot
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angles)
+    poses[:, 1, 0], poses[:, 0, 1] = np.sin(angles), -np.sin(angles)
+    path = Trajectory(np.arange(31.0), poses)
+    chosen = [int(np.abs(poses - T).sum((1, 2)).argmin()) for T in path.spread(0.1, 5.0)]
+    assert chosen == [0, 4, 8, 16, 22, 28, 30]  # more than 10 cm, more than 5 degrees, the last
+    assert Trajectory().spread(0.1, 5.0) == []
