@@ -31,7 +31,11 @@ RANKS: list[list[str]] = [
         *("edslam_ti.pictures", "edslam_ti.visualization"),
     ],
     ["edslam_ti.command_line", "edslam_ti.results", "edslam_ti.pipeline"],
-    [f"edslam_ti.reproduce{part}" for part in ("", ".cases", ".altered", ".recordings", ".runs", ".report")],
+    [
+        *("edslam_ti.reproduce", "edslam_ti.reproduce.cases", "edslam_ti.reproduce.altered"),
+        *("edslam_ti.reproduce.recordings", "edslam_ti.reproduce.runs", "edslam_ti.reproduce.ablations"),
+        *("edslam_ti.reproduce.report", "edslam_ti.reproduce.command"),
+    ],
     ["apps.*"],
 ]
 
@@ -70,7 +74,7 @@ LIBRARIES: dict[str, list[str]] = {
         "apps.*",
     ],
     "psutil": ["edslam_ti.pipeline"],
-    "tyro": ["edslam_ti.command_line", "apps.*"],
+    "tyro": ["edslam_ti.command_line", "edslam_ti.reproduce.*", "apps.*"],
 }
 USES_OPEN3D = [
     "edslam_ti.surface_errors",

@@ -11,14 +11,23 @@ import pytest
 from rich.console import Console
 from sequences import TINY, tiny_room
 
+from apps import reproduce
 from edslam_ti.camera import Camera
+from edslam_ti.command_line import UsageError
+from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import ConfigError, DataError
+from edslam_ti.reproduce.ablations import (
+    ablation_cases,
+    ablation_markdown,
+    ablation_rows,
+    ablation_variants,
+)
 from edslam_ti.reproduce.altered import AlteredSequence
 from edslam_ti.reproduce.cases import Case, Recording, Selection, all_cases, quick_cases
 from edslam_ti.reproduce.recordings import Recordings
-from edslam_ti.reproduce.report import markdown, write_report
+from edslam_ti.reproduce.report import insert_into, markdown, write_report
 from edslam_ti.reproduce.runs import Variant, methods_as_variants, result_file, run_all
 from edslam_ti.simulation import HandHeldPath
 from edslam_ti.simulation.depth_noise import viewing_cosine
@@ -111,7 +120,7 @@ def test_bench_records_failures_continues_and_is_resumed(tiny_folder: Path, tmp_
     variants = [Variant("quick", "ed_slam", quick), Variant("odd", "no_such_method", {})]
     recordings = TinyRecordings(tiny_folder)
     console = Console(quiet=True)
-    results = run_all(cases, variants, recordings, tmp_path, console)
+    results = list(run_all(cases, variants, recordings, tmp_path, console))
     assert [r["variant"] for r in results] == ["quick", "odd"] * 4
     assert results[0]["skipped"] == "no such data"
     assert results[3]["error"].startswith("KeyError: 'no_such_method' (")
@@ -125,9 +134,9 @@ def test_bench_records_failures_continues_and_is_resumed(tiny_folder: Path, tmp_
     assert json.loads(result_file(tmp_path, cases[1], variants[0]).read_text()) == good
 
     again = TinyRecordings(tiny_folder)
-    kept = run_all(cases[1:2], variants[:1], again, tmp_path, console)
+    kept = list(run_all(cases[1:2], variants[:1], again, tmp_path, console))
     assert (kept, again.opened) == ([good], [])
-    fresh = run_all(cases[1:2], variants[:1], again, tmp_path, console, fresh=True)
+    fresh = list(run_all(cases[1:2], variants[:1], again, tmp_path, console, fresh=True))
     assert again.opened == ["tiny"]
     assert fresh[0]["ate_rmse_cm"] == good["ate_rmse_cm"]  # runs repeat
 
@@ -204,3 +213,48 @@ def test_only_recordings_made_here_are_discarded(
     assert discarded == []
     first.discard(Recording("office0"))
     assert discarded == [made]
+
+
+def test_ablations_change_one_setting_and_share_the_default() -> None:
+    variants = ablation_variants()
+    assert variants[0].name == "ed_slam"
+    assert len({v.name for v in variants}) == len(variants)
+    for variant in variants[1:]:
+        assert len(variant.differences["tracking"]) == 1
+        Config(method=variant.method).updated(variant.differences)  # every setting exists
+    rows = ablation_rows()
+    assert [v.name for v in rows["Patch size (Table I of the paper)"].values()].count("ed_slam") == 1
+    cases = ablation_cases(("office0", "wall"), (0, 1))
+    assert [c.row for c in cases] == ["office0-kinect-20hz"] * 2 + ["wall-kinect-20hz"] * 2
+
+
+def test_ablation_tables_name_the_default_and_tell_of_failures() -> None:
+    results = [
+        result("office0-kinect-20hz", 0, v.name, 0.1 * k) for k, v in enumerate(ablation_variants(), 1)
+    ]
+    results.append({k: v for k, v in results[0].items() if k != "ate_rmse_cm"} | {"error": "bad", "row": "b"})
+    text = ablation_markdown(results)
+    assert "| 9 x 9 (default) | 0.100 | - | 0.100 | 0 | 1 |" in text
+    assert "| 5 x 5 | 0.200 | - | 0.200 | 0 | 1 |" in text
+    assert "- ed_slam: bad" in text
+
+
+def test_tables_are_inserted_between_their_marks(tmp_path: Path) -> None:
+    document = tmp_path / "experiments.md"
+    document.write_text("before\n<!-- ablations -->\nold\n<!-- end ablations -->\nafter\n")
+    for text in ("new\n\n", "newer"):
+        insert_into(document, "ablations", text)
+    assert document.read_text() == "before\n<!-- ablations -->\nnewer\n<!-- end ablations -->\nafter\n"
+    with pytest.raises(DataError, match="<!-- tracking -->"):
+        insert_into(document, "tracking", "x")
+
+
+def test_app_says_what_it_expects(tmp_path: Path) -> None:
+    for arguments, message in (
+        ([], "expected a command first: tracking, ablations"),
+        (["track"], "expected a command first"),
+        (["tracking", "--scenes", "nowhere"], "no case passes the filters"),
+        (["tracking", "--sceens", "wall"], "Unrecognized"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            reproduce.main(arguments)

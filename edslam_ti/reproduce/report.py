@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from edslam_ti.errors import DataError
 from edslam_ti.output import atomic_file
 from edslam_ti.visualization import plot_drift, plot_groups
 
@@ -62,6 +63,17 @@ def markdown(results: Sequence[Result], title: str) -> str:
     if problems:
         lines += ["## Without a result", "", *problems, ""]
     return "\n".join(lines)
+
+
+def insert_into(document: Path, name: str, text: str) -> None:
+    """Replace what a Markdown document holds between `<!-- NAME -->` and `<!-- end NAME -->`."""
+    begin, end = f"<!-- {name} -->\n", f"<!-- end {name} -->"
+    old = document.read_text()
+    if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
+        raise DataError(f"{document}: expected the lines '{begin.strip()}' and '{end}' once each; add them")
+    new = old[: old.index(begin) + len(begin)] + text.rstrip("\n") + "\n" + old[old.index(end) :]
+    with atomic_file(document) as temporary:
+        temporary.write_text(new)
 
 
 def _group_row(result: Result) -> str:

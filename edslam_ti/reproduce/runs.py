@@ -2,8 +2,9 @@
 
 import itertools
 import json
+import textwrap
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,6 +30,7 @@ from edslam_ti.trajectory import Trajectory
 
 Report = Callable[[str, float], None]  # what goes on, and the share of it that is done
 Value = TypeVar("Value")
+LONGEST_MESSAGE = 300  # characters; compilers tell long stories
 
 
 @dataclass(frozen=True)
@@ -130,14 +132,13 @@ def run_all(
     threads: int = 2,
     fresh: bool = False,
     keep_recordings: bool = True,
-) -> list[dict[str, Any]]:
-    """Run what has no result in `out` yet and return all results, in the order of cases and variants.
+) -> Iterator[dict[str, Any]]:
+    """Run what has no result in `out` yet and yield all results, in the order of cases and variants.
 
     A case that fails is recorded with its `error`, one whose data or library is absent as `skipped`; the
     rest go on, and the next call tries those again.
     """
     kernels.init("cpu", threads=threads)
-    results: list[dict[str, Any]] = []
     with _progress(console) as bar:
         task = bar.add_task("bench", total=len(cases) * len(variants), status="")
 
@@ -161,11 +162,10 @@ def run_all(
                         temporary.write_text(json.dumps(result, indent=1) + "\n")
                     console.print(describe(result), highlight=False, markup=False, soft_wrap=True)
                     console.file.flush()
-                results.append(result)
                 bar.advance(task)
+                yield result
             if not keep_recordings:
                 recordings.discard(recording)
-    return results
 
 
 def describe(result: dict[str, Any]) -> str:
@@ -224,7 +224,8 @@ def _or_problem(action: Callable[[], Value]) -> Value | dict[str, Any]:
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         place = "" if isinstance(error, EdSlamError) else f" ({Path(where.filename).name}:{where.lineno})"
-        return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}{place}"}
+        message = textwrap.shorten(str(error), LONGEST_MESSAGE)
+        return {"error": f"{type(error).__name__}: {message}{place}"}
 
 
 def _kept(file: Path) -> dict[str, Any] | None:

@@ -1,0 +1,90 @@
+"""What `apps/reproduce.py` does: its commands, and what each of them takes."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from edslam_ti.command_line import UsageError
+from edslam_ti.reproduce.cases import EVERYTHING, Selection, all_cases, quick_cases
+
+
+def tracking(
+    select: Annotated[Selection, tyro.conf.arg(name="")] = EVERYTHING,
+    methods: tuple[str, ...] = ("ed_slam", "ed_slam_paper", "open3d_icp", "open3d_rgbd"),
+    out: Path = Path("results/reproduce"),
+    data_dir: Path = Path("data"),
+    quick: bool = False,
+    mapping: bool = False,
+    fresh: bool = False,
+    keep_recordings: bool = True,
+    threads: int = 2,
+) -> None:
+    """Run methods over the bench.
+
+    Args:
+        select: filters
+        methods: methods to compare, side by side in the tables
+        out: folder that receives results.json, tracking.md, the pictures, and one file per run
+        data_dir: folder with trajectories/, scenes/ and slider_depth/; cases without their data are skipped
+        quick: four short cases instead of all
+        mapping: run the whole system instead of tracking alone
+        fresh: run again what has a result already
+        keep_recordings: false: delete each simulated recording after its last case
+        threads: CPU threads
+    """
+    cases = [case for case in (quick_cases() if quick else all_cases()) if select.includes(case)]
+    if not cases:
+        raise UsageError("no case passes the filters; leave some out")
+    # After the arguments: torch and Taichi take seconds to load.
+    from edslam_ti.reproduce.recordings import Recordings
+    from edslam_ti.reproduce.report import write_report
+    from edslam_ti.reproduce.runs import methods_as_variants, run_all
+
+    variants = methods_as_variants(methods, mapping)
+    recordings = Recordings(data_dir)
+    results: list[dict[str, Any]] = []
+    try:
+        results.extend(run_all(cases, variants, recordings, out, Console(), threads, fresh, keep_recordings))
+    finally:  # what there is before Ctrl-C, too
+        if results:
+            table = write_report(results, out, "Tracking")
+            print(f"{table}: {len(results)} of {len(cases) * len(variants)} runs")
+
+
+def ablations(
+    scenes: tuple[str, ...] = ("office0", "room0", "wall"),
+    seeds: tuple[int, ...] = (0,),
+    out: Path = Path("results/ablations"),
+    document: Path | None = None,
+    fresh: bool = False,
+    threads: int = 2,
+) -> None:
+    """Change one setting of the tracker at a time.
+
+    `document` holds the lines `<!-- ablations -->` and `<!-- end ablations -->`.
+
+    Args:
+        scenes: built-in scenes, with Kinect-like depth at 20 Hz
+        seeds: seeds of path and noise
+        out: folder that receives ablations.md and one file per run
+        document: Markdown file that gets the tables, too, between its marks for them
+        fresh: run again what has a result already
+        threads: CPU threads
+    """
+    from edslam_ti.reproduce.ablations import ablation_cases, ablation_markdown, ablation_variants
+    from edslam_ti.reproduce.recordings import Recordings
+    from edslam_ti.reproduce.report import insert_into
+    from edslam_ti.reproduce.runs import run_all
+
+    cases, recordings = ablation_cases(scenes, seeds), Recordings(Path())
+    results = list(run_all(cases, ablation_variants(), recordings, out, Console(), threads, fresh))
+    text = ablation_markdown(results)
+    (out / "ablations.md").write_text(text)
+    if document is not None:
+        insert_into(document, "ablations", text)
+    print(text)
+
+
+COMMANDS = {"tracking": tracking, "ablations": ablations}
