@@ -18,6 +18,7 @@ from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import ConfigError, DataError
+from edslam_ti.reproduce import runs
 from edslam_ti.reproduce.ablations import (
     ablation_cases,
     ablation_markdown,
@@ -112,7 +113,11 @@ def tiny_case(scene: str, **differences: Any) -> Case:
     return replace(Case("rooms", Recording(scene)), **differences)
 
 
-def test_bench_records_failures_continues_and_is_resumed(tiny_folder: Path, tmp_path: Path) -> None:
+def test_bench_records_failures_continues_and_is_resumed(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "event_replica.yaml").write_text("tracking: {levels: 2}")
+    monkeypatch.setattr(runs, "CONFIGS", tmp_path)
     cases = [tiny_case(s) for s in ("absent", "tiny", "broken")] + [
         tiny_case("tiny", depth="kinect", rate=10)
     ]
@@ -131,6 +136,7 @@ def test_bench_records_failures_continues_and_is_resumed(tiny_folder: Path, tmp_
     assert good["ate_at_depth_rmse_cm"] == good["ate_rmse_cm"]  # every frame has depth
     assert len(good["curve"]["path_m"]) == len(good["curve"]["drift_cm"]) == 14
     assert good["settings"]["tracking"]["num_patches"] == 100
+    assert good["settings"]["tracking"]["levels"] == 2  # the data set's
     assert json.loads(result_file(tmp_path, cases[1], variants[0]).read_text()) == good
 
     again = TinyRecordings(tiny_folder)
