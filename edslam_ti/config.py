@@ -40,6 +40,10 @@ class TrackingConfig(Stage):
     """Patch centres are drawn where the surface exceeds this (tau in Sec. III-B; not given there)."""
     max_depth_difference: float = Field(0.1, gt=0)
     """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
+    brightness: bool = True
+    """Align to log-brightness images made of events once there are some; False: time surfaces only."""
+    brightness_sigma: float = Field(0.08, gt=0)
+    """Standard deviation of a log-brightness residual."""
     references: Literal["previous", "keyframe", "both"] = "keyframe"
     """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
     directions: Literal["both", "forward"] = "both"

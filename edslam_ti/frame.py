@@ -52,25 +52,30 @@ class Frame:
         while len(self._pyramid) <= k:
             last = self._pyramid[-1]
             camera = last.camera.downscaled(2)
-            a, b, c, d = _corners(last.surface, camera.shape)
-            surface = 0.25 * (a + b + c + d)
-            self._pyramid.append(PyramidLevel(camera, surface, _downscaled_depth(last.depth, camera.shape)))
+            self._pyramid.append(PyramidLevel(camera, downscaled(last.surface), downscaled_depth(last.depth)))
         return self._pyramid[k]
 
 
-def _corners(image: np.ndarray, shape: tuple[int, int]) -> list[np.ndarray]:  # four [h, w]
-    """Return the four pixels under every pixel of the image at half size."""
-    h, w = shape
-    return [image[y : 2 * h : 2, x : 2 * w : 2] for y in (0, 1) for x in (0, 1)]
+def downscaled(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
+    """Return the means of 2x2 blocks; odd edges are cut off."""
+    a, b, c, d = _corners(image)
+    mean: np.ndarray = image.dtype.type(0.25) * (a + b + c + d)
+    return mean
 
 
-def _downscaled_depth(depth: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return means of four where all four depths exist and lie on one surface, else missing."""
-    a, b, c, d = _corners(depth, shape)
+def downscaled_depth(depth: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
+    """Return means of 2x2 blocks where all four depths exist and lie on one surface, else 0 (missing)."""
+    a, b, c, d = _corners(depth)
     low = np.minimum(np.minimum(a, b), np.minimum(c, d))
     high = np.maximum(np.maximum(a, b), np.maximum(c, d))
     is_smooth = (low > 0) & (high - low < 0.05 * high)
     return np.where(is_smooth, 0.25 * (a + b + c + d), np.float32(0))
+
+
+def _corners(image: np.ndarray) -> list[np.ndarray]:  # four [H / 2, W / 2]
+    """Return the four pixels under every pixel of the image at half size."""
+    h, w = (n // 2 for n in image.shape)
+    return [image[y : 2 * h : 2, x : 2 * w : 2] for y in (0, 1) for x in (0, 1)]
 
 
 class FrameBuilder:

@@ -132,3 +132,8 @@ def orthonormalized(T: np.ndarray) -> np.ndarray:  # [4, 4]
 def rotation_angle_deg(T: np.ndarray) -> float:  # [4, 4] -> degrees
     """Return the angle of the rotation part."""
     return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1.0, 1.0))))
+
+
+def log_vector(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6]
+    """Return `se3_log` of one motion."""
+    return se3_log(torch.from_numpy(T)).numpy()

@@ -136,6 +136,10 @@ class BidirectionalPatchTracker:
             self._previous = current
         return result
 
+    def refer_to(self, frame: Frame) -> None:
+        """Align the next frames to this one, whose pose is on the trajectory."""
+        self._keyframe = self._previous = self._with_patches(frame)
+
     def _track(
         self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory
     ) -> tuple[TrackingResult, float]:
@@ -174,7 +178,8 @@ class BidirectionalPatchTracker:
         T = guess
         references = [(r, trajectory.at(r.frame.timestamp)) for r in self._references()]
         for level in reversed(range(self._config.levels)):
-            T, system = self._levenberg_marquardt(current, references, T, level)
+            problem = self._problem(current, references, level)
+            T, system = levenberg_marquardt(problem.linearise, T, self._config.iterations)
         return _Alignment(orthonormalized(T), system)
 
     def _references(self) -> list[_Reference]:
@@ -185,33 +190,6 @@ class BidirectionalPatchTracker:
         if self._config.references == "keyframe" or self._keyframe is self._previous:
             return [self._keyframe]
         return [self._keyframe, self._previous]
-
-    def _levenberg_marquardt(
-        self,
-        current: _Reference,
-        references: list[tuple[_Reference, np.ndarray]],  # with their T_world_camera
-        T_world_camera: np.ndarray,  # [4, 4] start
-        level: int,
-    ) -> tuple[np.ndarray, NormalEquations]:
-        T, damping = T_world_camera, 1e-4
-        problem = self._problem(current, references, level)
-        system = problem.linearise(T)
-        for _ in range(self._config.iterations):
-            if system.num_surface < MIN_PIXELS:
-                break
-            H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
-            candidate_T = T @ exp_matrix(-np.linalg.solve(H, system.g))
-            candidate = problem.linearise(candidate_T)
-            gain = 1 - _mean_cost(candidate) / _mean_cost(system)
-            if gain > 0:
-                T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
-                if gain < SMALL_GAIN:
-                    break
-            else:
-                damping *= 8
-                if damping > 1e3:
-                    break
-        return T, system
 
     def _problem(
         self, current: _Reference, references: list[tuple[_Reference, np.ndarray]], level: int
@@ -255,6 +233,32 @@ class BidirectionalPatchTracker:
             patches = extract_patches(level.surface, level.depth, at_level.astype(np.int32), size)
             points.append(patches.points(level.camera.intrinsics))
         return _Reference(frame, points, has_surface)
+
+
+def levenberg_marquardt(
+    linearise: Callable[[np.ndarray], NormalEquations],
+    T_world_camera: np.ndarray,  # [4, 4] start
+    iterations: int,
+) -> tuple[np.ndarray, NormalEquations]:
+    """Minimise over T <- T exp(xi), given the normal equations at a pose; return pose and system."""
+    T, damping = T_world_camera, 1e-4
+    system = linearise(T)
+    for _ in range(iterations):
+        if system.num_surface < MIN_PIXELS:
+            break
+        H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
+        candidate_T = T @ exp_matrix(-np.linalg.solve(H, system.g))
+        candidate = linearise(candidate_T)
+        gain = 1 - _mean_cost(candidate) / _mean_cost(system)
+        if gain > 0:
+            T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
+            if gain < SMALL_GAIN:
+                break
+        else:
+            damping *= 8
+            if damping > 1e3:
+                break
+    return T, system
 
 
 def _distinct(centres: np.ndarray) -> np.ndarray:  # [P, 2] of non-negative int64

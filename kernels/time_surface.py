@@ -57,6 +57,20 @@ def _accumulate_polarity(
                     sums[b, y[i], x[i]] = sums[b, y[i], x[i]] + ti.cast(polarity[i], ti.i16)
 
 
+@ti.kernel
+def _add_polarity(
+    x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
+    y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
+    polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N]
+    total: ti.types.ndarray(ti.i32, ndim=2),  # in and out [H, W]
+    last: ti.types.ndarray(ti.i8, ndim=2),  # in and out [H, W]
+):
+    ti.loop_config(serialize=True)  # the last event wins
+    for i in range(x.shape[0]):
+        total[y[i], x[i]] = total[y[i], x[i]] + polarity[i]
+        last[y[i], x[i]] = polarity[i]
+
+
 def update_last_timestamps(
     x: np.ndarray,  # [N] int16
     y: np.ndarray,  # [N] int16
@@ -123,6 +137,22 @@ def accumulate_polarity(
         _check_inside(x, y, shape)
         _accumulate_polarity(x, y, polarity, np.asarray(first, np.int64), workers(), sums)
     return sums
+
+
+def add_polarity(
+    x: np.ndarray,  # [N] int16
+    y: np.ndarray,  # [N] int16
+    polarity: np.ndarray,  # [N] int8, -1 or +1, in order of time
+    total: np.ndarray,  # [H, W] int32, changed in place: sum of polarities
+    last: np.ndarray,  # [H, W] int8, changed in place: polarity of the newest event
+) -> None:
+    """Add events to a running sum of polarities (Eq. 11), and note each pixel's newest one."""
+    check_shape("y", y, x.shape)
+    check_shape("polarity", polarity, x.shape)
+    check_shape("last", last, total.shape)
+    if len(x):
+        _check_inside(x, y, total.shape)
+        _add_polarity(x, y, polarity, total, last)
 
 
 def _check_inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> None:

@@ -20,10 +20,11 @@ RANKS: list[list[str]] = [
         "edslam_ti.rendering",
         "edslam_ti.losses",
         "edslam_ti.brightness",
+        "edslam_ti.brightness_image",
     ],
     [
         *("edslam_ti.frame", "edslam_ti.tracking", "edslam_ti.keyframes", "edslam_ti.event_images"),
-        "edslam_ti.mapping",
+        *("edslam_ti.brightness_tracking", "edslam_ti.mapping"),
     ],
     ["edslam_ti.slam"],
     [
@@ -53,11 +54,11 @@ LIBRARIES: dict[str, list[str]] = {
     "yaml": ["edslam_ti.config"],
     "scipy": [
         *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.brightness"),
-        "edslam_ti.pictures",
+        *("edslam_ti.pictures", "edslam_ti.brightness_image"),
     ],
     "cv2": [
         *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.pictures"),
-        *("edslam_ti.brightness", "edslam_ti.event_images"),
+        *("edslam_ti.brightness", "edslam_ti.event_images", "edslam_ti.brightness_tracking"),
     ],
     "OpenEXR": ["edslam_ti.datasets.*"],
     "platformdirs": ["edslam_ti.datasets.*"],

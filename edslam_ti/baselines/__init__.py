@@ -25,10 +25,15 @@ class Method:
 def _ed_slam(
     sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.brightness_tracking import BrightnessTracker
     from edslam_ti.mapping import GaussianMapper
     from edslam_ti.tracking import BidirectionalPatchTracker
 
-    tracker = BidirectionalPatchTracker(config.tracking, config.seed)
+    tracker: Tracker
+    if config.tracking.brightness:
+        tracker = BrightnessTracker(sequence.camera, contrast_threshold, config.tracking, config.seed)
+    else:
+        tracker = BidirectionalPatchTracker(config.tracking, config.seed)
     return tracker, GaussianMapper(sequence.camera, contrast_threshold, config)
 
 
@@ -64,7 +69,7 @@ METHODS: dict[str, Method] = {
     "ed_slam_paper": Method(
         "Eq. 5 to the letter: time surfaces alone, consecutive frames, both directions",
         _ed_slam,
-        {"tracking": {"references": "previous", "depth_weight": 0.0}},
+        {"tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0}},
     ),
     "open3d_rgbd": Method(
         "Open3D's RGB-D odometry and TSDF volume; needs images, uses no events", _open3d_rgbd

@@ -1,0 +1,482 @@
+"""Tracking against log-brightness images made of events; time surfaces until there is one.
+
+A keyframe's image comes from events alone (brightness_image.py). Adding the change measured since then
+gives the image at any later time, so that tracking is direct alignment of images and depth, as with a
+camera: unbiased where time surfaces (Eq. 5) lag behind their edges, and possible between depth images.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from edslam_ti.brightness_image import BrightnessChange, Observation, solve_log_brightness_image
+from edslam_ti.camera import Camera
+from edslam_ti.config import TrackingConfig
+from edslam_ti.frame import Frame, downscaled, downscaled_depth
+from edslam_ti.geometry import exp_matrix, log_vector, orthonormalized, rigid_inverse, rotation_angle_deg
+from edslam_ti.tracking import (
+    MAX_CONDITION,
+    MIN_PIXELS,
+    BidirectionalPatchTracker,
+    TrackingResult,
+    levenberg_marquardt,
+)
+from edslam_ti.trajectory import Trajectory
+from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, ResidualModel
+
+IMAGE_WIDTH = 192  # pixels, roughly
+WINDOW = 12  # frames a keyframe's image is solved from
+MIN_FRAMES = 5  # before the first image is solved
+MIN_FLOW = 1.5  # pixels of brightness images that the scene must have moved before the first image is solved
+STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
+MIN_SOLVE_FRAMES = 3  # between two solutions for one keyframe
+SILENT_SHARE = 0.02  # fewer events than this share of the usual number: the camera or the stream stopped
+SILENT_FLOW = 0.3  # pixels a frame: a camera this fast does not stop within one frame
+MAX_MISFIT = 0.25  # log brightness, median: beyond, the image is not that of the keyframe's surfaces
+MAX_MISFITS = 4  # such frames in a row after which the image is given up
+REVISIT_OVERLAP = 0.6  # share of an old keyframe's pixels that must be in view again
+REVISIT_MISFIT = 0.12  # log brightness, median
+REVISIT_DISTANCE, REVISIT_ANGLE = 0.3, 15.0  # metres, degrees: larger corrections are not believed
+MAX_REVISITS = 3  # old keyframes compared with a new one
+MIN_MATCHES = 15  # features that must agree for a keyframe to be recognised
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """What was measured up to one frame, at the size of brightness images."""
+
+    index: int  # of the frame in the trajectory
+    change: np.ndarray  # [h, w] log brightness since the stretch of events began
+    depth: np.ndarray | None  # [h, w] metres, 0 = missing
+
+
+@dataclass
+class _Keyframe:
+    """A frame with depth, and the log-brightness image solved for it."""
+
+    index: int  # of the frame in the trajectory
+    stretch: int  # of uninterrupted events
+    change: np.ndarray  # [h, w] as in `_Moment`
+    depth: np.ndarray  # [h, w] metres, 0 = missing
+    log_brightness: np.ndarray  # [h, w]
+    points: list[Tensor]  # pixels to align, at full and at half size; see `Patches.points`
+    next_solution: int  # index of the frame at which the image is solved for again
+    is_compared: bool = False  # with older keyframes
+
+    def image_at(self, moment: _Moment) -> np.ndarray:  # [h, w]
+        """Return the log brightness at another time of the same stretch of events."""
+        return self.log_brightness + (moment.change - self.change)
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    T_world_camera: np.ndarray  # [4, 4]
+    system: NormalEquations  # at full size
+    misfit: float  # median absolute difference of log brightness
+
+    @property
+    def overlap(self) -> float:
+        """Share of the keyframe's pixels in view."""
+        return self.system.num_surface / max(self.system.num_usable, 1)
+
+
+class BrightnessTracker:
+    """Aligns each frame to the current keyframe's log-brightness image and depth.
+
+    Until the first image is solved for, and while events are missing, time surfaces and depth are
+    aligned instead. Poses of recent frames are refined when a better image is known; where an older
+    keyframe comes into view again, the drift since then is taken back.
+    """
+
+    def __init__(self, camera: Camera, contrast_threshold: float, config: TrackingConfig, seed: int) -> None:
+        self._config = config
+        # Images are halved until they are about 192 pixels wide: the noise of events averages out.
+        self._level = max(0, round(math.log2(camera.width / IMAGE_WIDTH)))
+        self._cameras = [camera.downscaled(2 ** (self._level + k)) for k in range(2)]
+        self._contrast_threshold = contrast_threshold
+        self._random = np.random.default_rng(seed + 1)
+        self._num_pixels = config.num_patches * config.patch_size**2 // 4
+        self._surface_tracker = BidirectionalPatchTracker(config, seed)
+        self._model = ResidualModel(
+            max_depth_difference=config.max_depth_difference,
+            surface_sigma=config.brightness_sigma,
+            depth_weight=config.depth_weight,
+            depth_sigma=config.depth_sigma,
+            depth_sigma_2=config.depth_sigma_2,
+            huber_threshold=config.huber_threshold,
+        )
+        self._change = BrightnessChange(camera.shape)
+        self._stretch, self._stretch_start = 0, 0  # number and first frame of the stretch of events
+        self._moments: list[_Moment] = []  # the last frames of the stretch
+        self._keyframe: _Keyframe | None = None  # None: no image yet
+        self._old_keyframes: list[_Keyframe] = []
+        self._anchor: Frame | None = None  # the last frame with depth and events
+        self._usual_events = 0.0
+        self._num_misfits = 0
+        self._path = _Path(Trajectory())
+
+    def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+        """Return the pose of `frame`; earlier poses on the trajectory may be corrected."""
+        self._path = _Path(trajectory)
+        note = "" if len(trajectory) == 0 else self._noticed_gap(frame, guess)
+        moment = self._take_in(frame, len(trajectory))
+        if self._keyframe is None:
+            result = self._surface_tracker.track(frame, guess, trajectory)
+            self._path.newest = result.T_world_camera
+            if self._begin():
+                note = note or self._revisit() or "first brightness image"
+        else:
+            result, overlap = self._follow(moment, guess)
+            self._path.newest = result.T_world_camera
+            note = note or self._keep_up(moment, result.converged, overlap)
+        if frame.depth is not None and len(frame.events):
+            self._anchor = frame
+        message = result.message or note
+        return TrackingResult(self._path.newest, result.converged, result.quality, message)
+
+    # --- what is measured ---
+
+    def _take_in(self, frame: Frame, index: int) -> _Moment:
+        self._change.add(frame.events)
+        change = self._change.log_brightness(self._contrast_threshold)
+        for _ in range(self._level):
+            change = downscaled(change)
+        moment = _Moment(index, change, None if frame.depth is None else frame.level(self._level).depth)
+        self._moments = [*self._moments, moment][-WINDOW:]
+        return moment
+
+    def _noticed_gap(self, frame: Frame, guess: np.ndarray) -> str:
+        """Start anew where events are missing although the camera moves; return what happened."""
+        count, usual = len(frame.events), self._usual_events
+        if count >= SILENT_SHARE * usual:
+            self._usual_events = count if usual == 0 else 0.9 * usual + 0.1 * count
+            return ""
+        if self._keyframe is None:
+            self._begin_stretch(len(self._path.trajectory))
+            return ""
+        flow = self._flow(self._keyframe.depth, self._path.pose(-1), guess)
+        if flow < SILENT_FLOW:
+            return ""  # the camera has stopped: its image stays as it is
+        self._give_up_image()
+        return "events are missing: depth alone is aligned"
+
+    def _give_up_image(self) -> None:
+        assert self._keyframe is not None
+        self._old_keyframes.append(self._keyframe)
+        self._keyframe = None
+        self._begin_stretch(len(self._path.trajectory))
+        if self._anchor is not None:
+            self._surface_tracker.refer_to(self._anchor)
+
+    def _begin_stretch(self, index: int) -> None:
+        self._stretch, self._stretch_start = self._stretch + 1, index
+        self._change.reset()
+        self._moments = []
+        self._num_misfits = 0
+
+    # --- the first image of a stretch ---
+
+    def _begin(self) -> bool:
+        """Solve for the first keyframe's image, once the scene has moved enough; return whether."""
+        with_depth = [m for m in self._moments if m.depth is not None]
+        if len(self._moments) < MIN_FRAMES or not with_depth:
+            return False
+        middle = self._moments[len(self._moments) // 2].index
+        moment = min(with_depth, key=lambda m: abs(m.index - middle))
+        assert moment.depth is not None
+        if self._flow(moment.depth, self._path.pose(moment.index), self._path.newest) < MIN_FLOW:
+            return False
+        self._keyframe = self._new_keyframe(moment, np.zeros_like(moment.depth))
+        self._solve(reweightings=0, iterations=40)
+        for _ in range(2):  # image and poses in turn
+            self._solve()
+            self._realign(self._moments)
+        self._solve()
+        return True
+
+    def _new_keyframe(self, moment: _Moment, log_brightness: np.ndarray) -> _Keyframe:
+        assert moment.depth is not None
+        return _Keyframe(
+            moment.index, self._stretch, moment.change, moment.depth, log_brightness,
+            points=[], next_solution=self._moments[-1].index + MIN_SOLVE_FRAMES,
+        )  # fmt: skip
+
+    def _flow(self, depth: np.ndarray, T_world_a: np.ndarray, T_world_b: np.ndarray) -> float:
+        """Return the median distance in pixels by which what is seen from a moves until b."""
+        x, y, _, u, v = self._warped(depth, rigid_inverse(T_world_b) @ T_world_a)
+        return float(np.median(np.hypot(x - u, y - v))) if len(x) else 0.0
+
+    def _warped(self, depth: np.ndarray, T_b_a: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return where every fourth pixel of a depth image is seen from b: x, y, z, u, v."""
+        fx, fy, cx, cy = self._cameras[0].intrinsics
+        v, u = 2 * np.stack(np.nonzero(depth[::2, ::2]))
+        z = depth[v, u]
+        x, y, z = T_b_a[:3, :3] @ np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z]) + T_b_a[:3, 3:]
+        front = z > 0.05
+        x, y, z, u, v = (a[front] for a in (x, y, z, u, v))
+        return fx * x / z + cx, fy * y / z + cy, z, u, v
+
+    # --- frame by frame ---
+
+    def _follow(self, moment: _Moment, guess: np.ndarray) -> tuple[TrackingResult, float]:
+        """Return the frame's pose and the share of the keyframe in view."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        image = keyframe.image_at(moment)
+        best: tuple[TrackingResult, float] | None = None
+        for start in (guess, self._path.pose(-1)):  # constant velocity, then a sudden stop
+            aligned = self._align(keyframe, image, moment.depth, start)
+            result = self._judged(aligned, guess)
+            if best is None or result.quality > best[0].quality:
+                best = result, aligned.overlap
+            if result.converged:
+                break
+        assert best is not None
+        return best
+
+    def _judged(self, aligned: _Aligned, guess: np.ndarray) -> TrackingResult:
+        """Return the pose, or the guess and a reason where it cannot be trusted."""
+        system, overlap = aligned.system, aligned.overlap
+        quality = min(1.0, overlap) * max(0.0, 1 - aligned.misfit / MAX_MISFIT)
+        eigenvalues = np.linalg.eigvalsh(system.H)
+        message = ""
+        if system.num_surface < MIN_PIXELS:
+            message = f"only {system.num_surface} pixels of the keyframe in view"
+        elif overlap < self._config.min_inliers:
+            message = f"only {overlap:.0%} of the keyframe in view"
+        elif eigenvalues[0] <= eigenvalues[-1] / MAX_CONDITION:
+            message = "motion not fully observed (ill-conditioned)"
+        elif aligned.misfit > MAX_MISFIT:
+            message = f"brightness differs by {aligned.misfit:.2f} (median, log)"
+        if message:
+            return TrackingResult(guess, False, quality, message)
+        return TrackingResult(aligned.T_world_camera, True, quality)
+
+    def _keep_up(self, moment: _Moment, is_good: bool, overlap: float) -> str:
+        """Change the keyframe when too little of it is in view, improve its image now and then."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        self._num_misfits = 0 if is_good else self._num_misfits + 1
+        if self._num_misfits > MAX_MISFITS:
+            self._give_up_image()
+            return "brightness image given up"
+        if not is_good:
+            return ""
+        is_new = moment.depth is not None and overlap < self._config.min_overlap
+        if is_new:
+            self._old_keyframes.append(keyframe)
+            keyframe = self._keyframe = self._new_keyframe(moment, keyframe.image_at(moment))
+        elif moment.index < keyframe.next_solution:
+            return ""
+        self._solve()
+        # Poses without depth hang on the image alone: they gain most from a better one.
+        self._realign([m for m in self._moments if m.depth is None])
+        keyframe.next_solution = moment.index + max(MIN_SOLVE_FRAMES, moment.index - keyframe.index)
+        return self._revisit() if is_new else ""
+
+    def _solve(self, reweightings: int = 1, iterations: int = 12) -> None:
+        """Solve for the keyframe's image from the last frames, and choose its pixels to align."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        T_world_keyframe = self._path.pose(keyframe.index)
+        observations = [
+            Observation(
+                rigid_inverse(self._path.pose(m.index)) @ T_world_keyframe,
+                m.change - keyframe.change,
+                m.depth,
+            )
+            for m in self._moments
+            if m.index != keyframe.index
+        ]
+        image = solve_log_brightness_image(
+            keyframe.depth, self._cameras[0], observations, keyframe.log_brightness,
+            iterations=iterations, reweightings=reweightings,
+        )  # fmt: skip
+        keyframe.log_brightness = image
+        keyframe.points = [
+            self._chosen(image, keyframe.depth, 0),
+            self._chosen(downscaled(image), downscaled_depth(keyframe.depth), 1),
+        ]
+
+    def _chosen(self, image: np.ndarray, depth: np.ndarray, level: int) -> Tensor:  # [blocks, 4, LANES]
+        """Return random pixels with depth, those with a strong gradient first."""
+        down, right = np.gradient(image)
+        v, u = np.nonzero(depth)
+        order = self._random.permutation(len(v))
+        is_strong = np.hypot(down, right)[v, u][order] > STRONG_GRADIENT
+        order = np.concatenate([order[is_strong], order[~is_strong]])[: self._num_pixels >> level]
+        v, u = v[order], u[order]
+        pixels = np.stack([u, v, 1 / depth[v, u]], -1).astype(np.float32)
+        return Patches(pixels, image[v, u]).points(self._cameras[level].intrinsics)
+
+    def _align(
+        self,
+        keyframe: _Keyframe,
+        image: np.ndarray,  # [h, w] log brightness
+        depth: np.ndarray | None,  # [h, w] metres, 0 = missing
+        start: np.ndarray,  # [4, 4] T_world_camera
+    ) -> _Aligned:
+        """Align an image, and its depth where there is any, to a keyframe, coarse to fine."""
+        if depth is None:
+            depth = np.zeros_like(image)
+        T_world_keyframe = self._path.pose(keyframe.index)
+        views = [cv2.merge([image, depth]), cv2.merge([downscaled(image), downscaled_depth(depth)])]
+        T = start
+        for level in (1, 0):
+            alignment = Alignment(
+                [Direction(keyframe.points[level], 0, self._model)], views[level][None],
+                self._cameras[level].intrinsics,
+            )  # fmt: skip
+
+            def linearise(T_world_camera: np.ndarray, alignment: Alignment = alignment) -> NormalEquations:
+                # T exp(xi) moves T_camera_keyframe to exp(-xi) T_camera_keyframe
+                (system,) = alignment.linearise([rigid_inverse(T_world_camera) @ T_world_keyframe])
+                return system.transformed(-np.eye(6))
+
+            T, system = levenberg_marquardt(linearise, T, self._config.iterations)
+        T = orthonormalized(T)
+        difference = self._difference(keyframe, image, T)
+        misfit = float(np.median(np.abs(difference))) if len(difference) else np.inf
+        return _Aligned(T, system, misfit)
+
+    def _difference(self, keyframe: _Keyframe, image: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return an image less a keyframe's, at pixels of the keyframe in view (nearest neighbours)."""
+        T = rigid_inverse(T_world_camera) @ self._path.pose(keyframe.index)
+        x, y, _, u, v = self._warped(keyframe.depth, T)
+        column, row = np.rint(x).astype(int), np.rint(y).astype(int)
+        height, width = image.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return image[row[inside], column[inside]] - keyframe.log_brightness[v[inside], u[inside]]
+
+    def _realign(self, moments: list[_Moment]) -> None:
+        """Align recent frames once more, to a better image than they were tracked with."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        for moment in moments:
+            if moment.index in (0, keyframe.index):
+                continue
+            start = self._path.pose(moment.index)
+            aligned = self._align(keyframe, keyframe.image_at(moment), moment.depth, start)
+            if self._judged(aligned, start).converged:
+                self._path.replace(moment.index, aligned.T_world_camera)
+
+    # --- places seen before ---
+
+    def _revisit(self) -> str:
+        """Take back the drift since an older keyframe that is in view again; return what happened."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        T_now = self._path.pose(keyframe.index)
+        is_new_stretch = all(old.stretch != keyframe.stretch for old in self._old_keyframes)
+        num_compared = 0
+        for old in self._old_keyframes:  # the oldest has drifted least
+            if not is_new_stretch and keyframe.index - old.index < 2 * WINDOW:
+                break
+            if self._share_in_view(old, T_now) < REVISIT_OVERLAP:
+                continue
+            num_compared += 1
+            aligned = self._compared(old, keyframe, T_now)
+            if aligned is None and is_new_stretch:
+                recognised = self._recognised(old, keyframe)
+                aligned = None if recognised is None else self._compared(old, keyframe, recognised)
+            if aligned is not None:
+                self._correct(aligned.T_world_camera, old, is_new_stretch)
+                return f"place of frame {old.index} seen again"
+            if num_compared == MAX_REVISITS:
+                break
+        return ""
+
+    def _share_in_view(self, old: _Keyframe, T_world_camera: np.ndarray) -> float:
+        camera = self._cameras[0]
+        x, y, _, _, _ = self._warped(old.depth, rigid_inverse(T_world_camera) @ self._path.pose(old.index))
+        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        return float(inside.sum() / max(np.count_nonzero(old.depth[::2, ::2]), 1))
+
+    def _compared(self, old: _Keyframe, new: _Keyframe, start: np.ndarray) -> _Aligned | None:
+        """Return the new keyframe's pose by alignment to an older one, or None where they do not match."""
+        T = start
+        for _ in range(2):  # images are known up to an offset
+            difference = self._difference(old, new.log_brightness, T)
+            if len(difference) < MIN_PIXELS // 4:
+                return None
+            image = new.log_brightness - np.float32(np.median(difference))
+            aligned = self._align(old, image, new.depth, T)
+            T = aligned.T_world_camera
+        correction = rigid_inverse(self._path.pose(new.index)) @ T
+        is_credible = (
+            self._judged(aligned, start).converged
+            and aligned.misfit < REVISIT_MISFIT
+            and aligned.overlap > REVISIT_OVERLAP
+            and float(np.linalg.norm(correction[:3, 3])) < REVISIT_DISTANCE
+            and rotation_angle_deg(correction) < REVISIT_ANGLE
+        )
+        return aligned if is_credible else None
+
+    def _recognised(self, old: _Keyframe, new: _Keyframe) -> np.ndarray | None:  # [4, 4]
+        """Return the new keyframe's pose by features matched with an older one (SIFT, PnP), or None."""
+        detector = cv2.SIFT.create(nfeatures=500, contrastThreshold=0.02)
+        found = [detector.detectAndCompute(_as_picture(k.log_brightness), None) for k in (old, new)]
+        (old_points, old_features), (new_points, new_features) = found
+        if old_features is None or new_features is None or min(len(old_points), len(new_points)) < 2:
+            return None
+        pairs = cv2.BFMatcher().knnMatch(old_features, new_features, k=2)
+        matches = [p[0] for p in pairs if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
+        at_old = np.array([old_points[m.queryIdx].pt for m in matches]).reshape(-1, 2)
+        at_new = np.array([new_points[m.trainIdx].pt for m in matches]).reshape(-1, 2)
+        u, v = np.rint(at_old).astype(int).T
+        z = old.depth[v, u].astype(float)
+        known = z > 0
+        if known.sum() < MIN_MATCHES:
+            return None
+        fx, fy, cx, cy = self._cameras[0].intrinsics
+        points = np.stack([(at_old[:, 0] - cx) / fx * z, (at_old[:, 1] - cy) / fy * z, z], -1)
+        cv2.setRNGSeed(0)
+        is_solved, rotation, translation, inliers = cv2.solvePnPRansac(
+            points[known], at_new[known], self._cameras[0].matrix, None, reprojectionError=2.0
+        )
+        if not is_solved or inliers is None or len(inliers) < MIN_MATCHES:
+            return None
+        T_new_old = np.eye(4)
+        T_new_old[:3, :3], T_new_old[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+        return self._path.pose(old.index) @ rigid_inverse(T_new_old)
+
+    def _correct(self, T_world_camera: np.ndarray, old: _Keyframe, is_new_stretch: bool) -> None:
+        """Move the keyframe to its corrected pose, later frames with it, and those since `old` in part."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        twist = log_vector(T_world_camera @ rigid_inverse(self._path.pose(keyframe.index)))
+        end = self._stretch_start if is_new_stretch else keyframe.index
+        start = max((k.index for k in self._old_keyframes), default=0) if is_new_stretch else old.index
+        for index in range(start + 1, len(self._path)):
+            share = min(1.0, (index - start) / max(end - start, 1))
+            self._path.replace(index, exp_matrix(share * twist) @ self._path.pose(index))
+
+
+class _Path:
+    """The trajectory and the newest frame's pose, which is not on it yet."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.newest = np.eye(4)
+
+    def __len__(self) -> int:
+        return len(self.trajectory) + 1
+
+    def pose(self, index: int) -> np.ndarray:  # [4, 4]
+        """Return a frame's pose; -1 is the last on the trajectory."""
+        return self.newest if index == len(self.trajectory) else self.trajectory.pose(index)
+
+    def replace(self, index: int, T_world_camera: np.ndarray) -> None:
+        """Overwrite a frame's pose."""
+        if index == len(self.trajectory):
+            self.newest = T_world_camera
+        else:
+            self.trajectory.replace(index, T_world_camera)
+
+
+def _as_picture(log_brightness: np.ndarray) -> np.ndarray:  # [h, w] uint8
+    low, high = np.percentile(log_brightness, (1, 99))
+    return np.clip(255 * (log_brightness - low) / max(high - low, 1e-6), 0, 255).astype(np.uint8)
