@@ -2,9 +2,10 @@
 
 Taichi normally takes vectors apart into scalars, and LLVM does not put them together again. A kernel
 under `@vector_instructions` is compiled without that step: arithmetic on a `ti.Vector` of LANES numbers
-becomes vector instructions, comparisons become masks for `ti.select`, and `fast_math` lets multiply and
-add fuse (it also assumes that nothing is NaN). Of the operations on vectors, Taichi 1.7 then cannot
-compile negation, casts, `abs`, `exp` and `log`; CPU memory must be aligned as torch's is.
+becomes vector instructions, comparisons become masks for `ti.select`, and a vector of other vectors' lanes
+becomes a shuffle. Of the operations on vectors, Taichi 1.7 then cannot compile negation, casts, `abs`,
+`rsqrt`, `exp` and `log`; CPU memory must be aligned as torch's is. `ti.min` looks out for NaN, `ti.select`
+does not: write the latter in inner loops.
 """
 
 import functools
@@ -17,6 +18,7 @@ import torch
 from kernels.runtime import float_dtype
 
 LANES = 16
+SUMS = 8  # of lanes, made at once
 
 
 def vector_instructions(kernel: Callable) -> Callable:
@@ -37,6 +39,7 @@ def vector_instructions(kernel: Callable) -> Callable:
 
 _Lanes = ti.types.vector(LANES)  # of the kernels' float type, whatever it is
 _IntegerLanes = ti.types.vector(LANES, ti.i32)
+_Sums = ti.types.vector(SUMS)
 
 
 def lanes(ndim: int) -> ti.types.ndarray:
@@ -49,11 +52,22 @@ def integer_lanes(ndim: int) -> ti.types.ndarray:
     return ti.types.ndarray(_IntegerLanes, ndim=ndim)
 
 
+def sums(ndim: int) -> ti.types.ndarray:
+    """Return the type of an array argument [..., SUMS] of floats with `ndim` leading dimensions."""
+    return ti.types.ndarray(_Sums, ndim=ndim)
+
+
 def exp_coefficients() -> list[float]:
     """Return the polynomial in x through exp(x / 8) at the Chebyshev nodes of [0, ln 256]."""
     degree = 11 if float_dtype() == torch.float64 else 5  # relative error 1e-16 or 1e-7
     series = np.polynomial.Chebyshev.interpolate(lambda x: np.exp(x / 8), degree, domain=[0, np.log(256)])
     return series.convert(kind=np.polynomial.Polynomial).coef.tolist()
+
+
+def log_coefficients() -> list[float]:
+    """Return 2, 2/3, 2/5, ...: the series of log((1 + y) / (1 - y)) in y, y^3, y^5, ..."""
+    terms = 12 if float_dtype() == torch.float64 else 5
+    return [2 / (2 * k + 1) for k in range(terms)]
 
 
 @ti.func
@@ -74,6 +88,18 @@ def exp(x):
 
 
 @ti.func
+def log(x):
+    """log(x) = 16 log(x^(1/16)) for 1e-3 <= x <= 1e3; less exact farther from 1."""
+    root = ti.sqrt(ti.sqrt(ti.sqrt(ti.sqrt(x))))
+    y = (root - 1.0) / (root + 1.0)  # at most 0.22
+    coefficients = ti.static(log_coefficients())
+    series = y * y * coefficients[-1] + coefficients[-2]
+    for k in ti.static(range(len(coefficients) - 3, -1, -1)):
+        series = series * (y * y) + coefficients[k]
+    return 16.0 * y * series
+
+
+@ti.func
 def largest(v):
     """Largest of the lanes, by halves: `max()` takes them one after the other and looks out for NaN."""
     parts = [v[lane] for lane in range(LANES)]
@@ -82,3 +108,60 @@ def largest(v):
         for lane in ti.static(range(half)):
             parts[lane] = ti.select(parts[lane] > parts[lane + half], parts[lane], parts[lane + half])
     return parts[0]
+
+
+@ti.func
+def split_columns(
+    source: ti.template(),  # [G * width] lanes of a table [G * LANES, width]
+    group,
+    target: ti.template(),  # [>= row + width, G] lanes
+    row: ti.template(),
+    width: ti.template(),
+):
+    """Columns of LANES rows of a table, as rows of `target`."""
+    numbers = [source[group * width + k // LANES][k % LANES] for k in range(width * LANES)]
+    for column in ti.static(range(width)):
+        target[row + column, group] = ti.Vector([numbers[lane * width + column] for lane in range(LANES)])
+
+
+@ti.func
+def join_columns(
+    source: ti.template(), row: ti.template(), width: ti.template(), group, target: ti.template()
+):
+    """Undo `split_columns`."""
+    columns = [source[row + column, group] for column in range(width)]
+    for k in ti.static(range(width)):
+        target[group * width + k] = ti.Vector(
+            [columns[(k * LANES + lane) % width][(k * LANES + lane) // width] for lane in range(LANES)]
+        )
+
+
+@ti.func
+def _folded(a, b):
+    """The two halves of a, added, and then those of b."""
+    low = ti.Vector([a[k] for k in range(8)] + [b[k] for k in range(8)])
+    high = ti.Vector([a[8 + k] for k in range(8)] + [b[8 + k] for k in range(8)])
+    return low + high
+
+
+@ti.func
+def _quarters_added(a, b):
+    """Of two results of `_folded`: the halves of each half, added."""
+    low = ti.Vector([v[8 * h + k] for v in (a, b) for h in range(2) for k in range(4)])
+    high = ti.Vector([v[8 * h + 4 + k] for v in (a, b) for h in range(2) for k in range(4)])
+    return low + high
+
+
+@ti.func
+def _eighths_added(a, b):
+    low = ti.Vector([v[4 * q + k] for v in (a, b) for q in range(4) for k in range(2)])
+    high = ti.Vector([v[4 * q + 2 + k] for v in (a, b) for q in range(4) for k in range(2)])
+    return low + high
+
+
+@ti.func
+def sums_of(a, b, c, d, e, f, g, h):
+    """Sums of the lanes of SUMS vectors as one vector, in a tenth of the steps of SUMS single sums."""
+    ab, cd, ef, gh = _folded(a, b), _folded(c, d), _folded(e, f), _folded(g, h)
+    pairs = _eighths_added(_quarters_added(ab, cd), _quarters_added(ef, gh))
+    return ti.Vector([pairs[2 * k] for k in range(SUMS)]) + ti.Vector([pairs[2 * k + 1] for k in range(SUMS)])

@@ -4,63 +4,118 @@ For one Gaussian with mean mu, rotation R(q) and scales s, seen from T_camera_wo
 
     p  = R_c mu + t_c                             camera frame, metres
     m  = (f_x p_x / p_z + c_x, f_y p_y / p_z + c_y)     pixels
-    J  = [f_x/p_z, 0, -f_x p_x/p_z^2;  0, f_y/p_z, -f_y p_y/p_z^2]
-    A  = J R_c R(q) diag(s)                       [2, 3]
+    W  = J R_c,  J = [f_x/p_z, 0, -f_x p_x/p_z^2;  0, f_y/p_z, -f_y p_y/p_z^2]
+    A  = W L,    L = R(q) diag(s)                 [2, 3]
     S' = A A^T + low_pass I                       Eq. 7, with the usual low-pass filter, 0.3 px^2
     K  = S'^-1                                    the conic: alpha = o exp(-1/2 d^T K d), Eq. 8
+
+One map is projected for several views at once: Gaussian i of view v is entry v * padded + i of what follows,
+and everything after projection (sorting, lists, slots) takes the views as one. The parameters are
+stored by rows [ROWS, padded], so that on a CPU the same component of LANES Gaussians is one vector;
+on a GPU the same functions work on one Gaussian per thread.
 """
 
+from dataclasses import dataclass
+
 import taichi as ti
+import torch
+from torch import Tensor
+
+from kernels.lanes import LANES, SUMS, join_columns, lanes, largest, split_columns, sums, vector_instructions
+from kernels.runtime import CHUNK, float_dtype, plain, workers
 
 NEAR = 0.05  # metres; nearer Gaussians are culled
 LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian ends where its alpha falls below this
 NOT_DRAWN = -1  # in place of the depth bits, which are positive
-
-# Columns of the projected record [N, FEATURES + 1 + C]; the features are the depth and the colours
-MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, EXTENT, HALF_WIDTH, HALF_HEIGHT, FEATURES = range(10)
-# Columns of the record's gradient [pairs, GRADIENT_FEATURES + 1 + C]: as above up to the opacity, features
-GRADIENT_FEATURES = 6
+MARGIN = 0.3  # of the image's size: the affine approximation is useless farther outside it
+BLOCK = 4  # pixels across and down that a CPU handles at once: LANES of them
+SPANS = 6  # rows of blocks for which the exact extent of an ellipse is kept; beyond, its box is
+HALF = 4096  # a * HALF + b holds two counts of blocks in one float
 MAX_TILES = 256  # across and down: a Gaussian's first and last tile column and row fit into one integer
+SLACK = 0.01  # pixels around an ellipse, so that rounding cuts no pixel off its lists
+PART = 32  # groups of lanes that share a partial sum of the pose gradient, added in float64
+
+# Rows of the Gaussians' parameters [ROWS + C, padded], then the colours
+MEAN, QUAT, SCALE, OPACITY, COLOR = 0, 3, 7, 10, 11
+# Columns of the projected record; the features are the depth and the colours
+MEAN_X, MEAN_Y, HALF_K_XX, K_XY, HALF_K_YY, EXTENT, FEATURES = range(7)
+# and, from gradient_size(C) on, the blocks it touches: columns, rows, and columns in each of SPANS rows
+COLUMNS, ROWS, SPAN = range(3)
+# Columns of the record's gradient: sums over pixels of v = dL / d ln(alpha), and of v times distances d
+V_SUM, V_X, V_Y, V_XX, V_XY, V_YY, GRAD_FEATURES = range(7)
+
+
+def gradient_size(channels: int) -> int:
+    """Return the numbers in the gradient of a record, GRAD_FEATURES + 1 + C, rounded up."""
+    return SUMS * ((GRAD_FEATURES + channels) // SUMS + 1)
+
+
+def record_size(channels: int) -> int:
+    """Return the numbers in a record: FEATURES + 1 + C, rounded up, and the blocks."""
+    return gradient_size(channels) + SPAN + SPANS
 
 
 @ti.func
-def rotation_of(q):
-    """Rotation matrix of a unit quaternion wxyz."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    return ti.Matrix(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+def once(x):
+    """x, computed once: entries of a list are otherwise computed wherever they are used."""
+    return x
+
+
+@ti.func
+def quaternion_inverse_norm(gaussians: ti.template(), i):
+    w, x = gaussians[QUAT, i], gaussians[QUAT + 1, i]
+    y, z = gaussians[QUAT + 2, i], gaussians[QUAT + 3, i]
+    return 1.0 / ti.sqrt(w * w + x * x + y * y + z * z)
+
+
+@ti.func
+def rotation_of(w, x, y, z):
+    """The nine entries of the rotation matrix of a unit quaternion, by rows."""
+    return (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@ti.func
+def ellipses(gaussians: ti.template(), i, poses: ti.template(), v, fx, fy, cx, cy, low_pass):
+    """m_x, m_y, p_z, and the entries xx, xy, yy of S' for Gaussian(s) i in view v; unseen if p_z <= NEAR."""
+    R_c = [[poses[v, a, b] for b in range(3)] for a in range(3)]
+    mean = [gaussians[MEAN + k, i] for k in range(3)]
+    p = [
+        once(R_c[a][0] * mean[0] + R_c[a][1] * mean[1] + R_c[a][2] * mean[2] + poses[v, a, 3])
+        for a in range(3)
+    ]
+    z = p[2]
+    inverse_z = 1.0 / ti.select(z > NEAR, z, 1.0)
+    q = quaternion_inverse_norm(gaussians, i)
+    R = rotation_of(
+        gaussians[QUAT, i] * q,
+        gaussians[QUAT + 1, i] * q,
+        gaussians[QUAT + 2, i] * q,
+        gaussians[QUAT + 3, i] * q,
     )
+    j00, j11 = fx * inverse_z, fy * inverse_z
+    u, w = j00 * p[0], j11 * p[1]
+    j02, j12 = (0.0 - u) * inverse_z, (0.0 - w) * inverse_z
+    cov_xx, cov_xy, cov_yy = z * 0.0 + low_pass, z * 0.0, z * 0.0 + low_pass
+    W = [[once(j00 * R_c[0][m] + j02 * R_c[2][m]), once(j11 * R_c[1][m] + j12 * R_c[2][m])] for m in range(3)]
+    for k in ti.static(range(3)):
+        a = (W[0][0] * R[k] + W[1][0] * R[3 + k] + W[2][0] * R[6 + k]) * gaussians[SCALE + k, i]
+        b = (W[0][1] * R[k] + W[1][1] * R[3 + k] + W[2][1] * R[6 + k]) * gaussians[SCALE + k, i]
+        cov_xx += a * a
+        cov_xy += a * b
+        cov_yy += b * b
+    return u + cx, w + cy, z, cov_xx, cov_xy, cov_yy
 
 
 @ti.func
-def load_pose(T: ti.template()):
-    R = ti.Matrix([[T[0, 0], T[0, 1], T[0, 2]], [T[1, 0], T[1, 1], T[1, 2]], [T[2, 0], T[2, 1], T[2, 2]]])
-    return R, ti.Vector([T[0, 3], T[1, 3], T[2, 3]])
-
-
-@ti.func
-def load_quaternion(quats: ti.template(), i):
-    q = ti.Vector([quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]])
-    norm = ti.sqrt(q.dot(q))
-    return q / norm, norm
-
-
-@ti.func
-def tiles_between(low, high, size, tile):
-    """First and last tile, of a row or column of them, that holds a pixel of [low, high]."""
-    first = ti.max(0, ti.cast(ti.ceil(low), ti.i32))
-    last = ti.min(size - 1, ti.cast(ti.floor(high), ti.i32))
-    return first // tile, ti.select(first <= last, last // tile, -1)
-
-
-@ti.func
-def pack_tiles(left, right, top, bottom):
-    return (left << 24) | (right << 16) | (top << 8) | bottom
+def first_and_last(low, high, size):
+    """The first and last pixel in [low, high], of a row or column of `size`; first > last: none."""
+    first, last = ti.ceil(low - SLACK), ti.floor(high + SLACK)
+    return ti.select(first > 0.0, first, 0.0), ti.select(last < size - 1.0, last, size - 1.0)
 
 
 @ti.func
@@ -69,15 +124,122 @@ def unpack_tiles(packed):
     return (packed >> 24) & 255, (packed >> 16) & 255, (packed >> 8) & 255, packed & 255
 
 
+@ti.func
+def differentiate(
+    # inputs
+    gaussians: ti.template(), i, poses: ti.template(), fx, fy, low_pass,
+    gradient_2d: ti.template(),  # [gradient_size(C) + 1, V * n] the last row: 1 where there are any
+    # outputs
+    gradient: ti.template(),  # [COLOR + C, n]
+    pose_parts: ti.template(), part,  # [V, parts, 12] rows of [dR | dt], added to
+    C: ti.template(),
+):  # fmt: skip
+    """Gradients of Gaussian(s) i and of the poses from those of the records in all views."""
+    n = gaussians.shape[1]
+    zero = gaussians[MEAN, i] * 0.0
+    mean = [gaussians[MEAN + k, i] for k in range(3)]
+    scale = [gaussians[SCALE + k, i] for k in range(3)]
+    inverse_norm = quaternion_inverse_norm(gaussians, i)
+    q = [once(gaussians[QUAT + k, i] * inverse_norm) for k in range(4)]
+    R = rotation_of(q[0], q[1], q[2], q[3])
+    L = [[once(R[3 * m + k] * scale[k]) for k in range(3)] for m in range(3)]
+    dL = [[once(zero) for k in range(3)] for m in range(3)]
+    dmean = [once(zero) for _ in range(3)]
+    dopacity = once(zero)
+    dcolor = [once(zero) for _ in range(C)]
+    for v in range(poses.shape[0]):
+        at = v * n + i
+        g = [once(gradient_2d[k, at]) for k in range(GRAD_FEATURES + 1)]
+        R_c = [[poses[v, a, b] for b in range(3)] for a in range(3)]
+        p = [
+            once(R_c[a][0] * mean[0] + R_c[a][1] * mean[1] + R_c[a][2] * mean[2] + poses[v, a, 3])
+            for a in range(3)
+        ]
+        drawn = gradient_2d[ti.static(gradient_size(C)), at] > 0.0
+        inverse_z = 1.0 / ti.select(drawn, p[2], 1.0)
+        j00, j11 = fx * inverse_z, fy * inverse_z
+        j02, j12 = (0.0 - j00) * p[0] * inverse_z, (0.0 - j11) * p[1] * inverse_z
+        W0 = [once(j00 * R_c[0][m] + j02 * R_c[2][m]) for m in range(3)]
+        W1 = [once(j11 * R_c[1][m] + j12 * R_c[2][m]) for m in range(3)]
+        A0 = [once(W0[0] * L[0][k] + W0[1] * L[1][k] + W0[2] * L[2][k]) for k in range(3)]
+        A1 = [once(W1[0] * L[0][k] + W1[1] * L[1][k] + W1[2] * L[2][k]) for k in range(3)]
+        S_xx = A0[0] * A0[0] + A0[1] * A0[1] + A0[2] * A0[2] + low_pass
+        S_xy = A0[0] * A1[0] + A0[1] * A1[1] + A0[2] * A1[2]
+        S_yy = A1[0] * A1[0] + A1[1] * A1[1] + A1[2] * A1[2] + low_pass
+        inverse_det = 1.0 / (S_xx * S_yy - S_xy * S_xy)
+        K_xx, K_xy, K_yy = S_yy * inverse_det, (0.0 - S_xy) * inverse_det, S_xx * inverse_det
+        # ln(alpha) = ln(o) - 1/2 d^T K d with d = pixel - m: dm = K sum v d, dK = -1/2 sum v d d^T
+        dx, dy = K_xx * g[V_X] + K_xy * g[V_Y], K_xy * g[V_X] + K_yy * g[V_Y]
+        dopacity += g[V_SUM]
+        # dS' = -K dK K, written as N K / 2 with N = K sum v d d^T
+        N_xx, N_xy = K_xx * g[V_XX] + K_xy * g[V_XY], K_xx * g[V_XY] + K_xy * g[V_YY]
+        N_yx, N_yy = K_xy * g[V_XX] + K_yy * g[V_XY], K_xy * g[V_XY] + K_yy * g[V_YY]
+        # dA = 2 dS' A, from S' = A A^T
+        D_xx, D_xy, D_yy = (
+            N_xx * K_xx + N_xy * K_xy, N_xx * K_xy + N_xy * K_yy, N_yx * K_xy + N_yy * K_yy,
+        )  # fmt: skip
+        dA0 = [once(D_xx * A0[k] + D_xy * A1[k]) for k in range(3)]
+        dA1 = [once(D_xy * A0[k] + D_yy * A1[k]) for k in range(3)]
+        dj00, dj02, dj11, dj12 = once(zero), once(zero), once(zero), once(zero)
+        dR_c = [[once(zero) for b in range(3)] for a in range(3)]
+        for m in ti.static(range(3)):
+            for k in ti.static(range(3)):
+                dL[m][k] += ti.select(drawn, W0[m] * dA0[k] + W1[m] * dA1[k], 0.0)  # A = W L
+            dW0 = dA0[0] * L[m][0] + dA0[1] * L[m][1] + dA0[2] * L[m][2]
+            dW1 = dA1[0] * L[m][0] + dA1[1] * L[m][1] + dA1[2] * L[m][2]
+            dj00 += dW0 * R_c[0][m]  # W = J R_c
+            dj02 += dW0 * R_c[2][m]
+            dj11 += dW1 * R_c[1][m]
+            dj12 += dW1 * R_c[2][m]
+            dR_c[0][m] += j00 * dW0
+            dR_c[1][m] += j11 * dW1
+            dR_c[2][m] += j02 * dW0 + j12 * dW1
+        # p enters through the mean m, the depth (a feature), and J
+        dp0 = (dx - dj02 * inverse_z) * j00
+        dp1 = (dy - dj12 * inverse_z) * j11
+        dp2 = g[GRAD_FEATURES] + dx * j02 + dy * j12 - (dj00 * j00 + dj11 * j11) * inverse_z
+        dp2 = dp2 - 2.0 * (dj02 * j02 + dj12 * j12) * inverse_z
+        dp = [once(ti.select(drawn, d, 0.0)) for d in (dp0, dp1, dp2)]
+        for a in ti.static(range(3)):
+            for m in ti.static(range(3)):
+                dmean[m] += R_c[a][m] * dp[a]  # p = R_c mu + t_c
+                entry = ti.select(drawn, dR_c[a][m] + dp[a] * mean[m], 0.0)
+                pose_parts[v, part, 4 * a + m] = pose_parts[v, part, 4 * a + m] + entry
+            pose_parts[v, part, 4 * a + 3] = pose_parts[v, part, 4 * a + 3] + dp[a]
+        for k in ti.static(range(C)):
+            dcolor[k] += gradient_2d[GRAD_FEATURES + 1 + k, at]
+    dR = [[once(dL[m][k] * scale[k]) for k in range(3)] for m in range(3)]  # L = R diag(s)
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    dunit = [
+        once(x * (dR[2][1] - dR[1][2]) + y * (dR[0][2] - dR[2][0]) + z * (dR[1][0] - dR[0][1])),
+        once(y * (dR[1][0] + dR[0][1]) + z * (dR[2][0] + dR[0][2]) + w * (dR[2][1] - dR[1][2])
+             - 2.0 * x * (dR[1][1] + dR[2][2])),
+        once(x * (dR[1][0] + dR[0][1]) + z * (dR[2][1] + dR[1][2]) + w * (dR[0][2] - dR[2][0])
+             - 2.0 * y * (dR[0][0] + dR[2][2])),
+        once(x * (dR[2][0] + dR[0][2]) + y * (dR[2][1] + dR[1][2]) + w * (dR[1][0] - dR[0][1])
+             - 2.0 * z * (dR[0][0] + dR[1][1])),
+    ]  # fmt: skip
+    along = w * dunit[0] + x * dunit[1] + y * dunit[2] + z * dunit[3]
+    for k in ti.static(range(3)):
+        gradient[MEAN + k, i] = dmean[k]
+        gradient[SCALE + k, i] = dL[0][k] * R[k] + dL[1][k] * R[3 + k] + dL[2][k] * R[6 + k]
+    for k in ti.static(range(4)):  # through the normalisation
+        gradient[QUAT + k, i] = 2.0 * (dunit[k] - q[k] * along) * inverse_norm
+    gradient[OPACITY, i] = dopacity / gaussians[OPACITY, i]
+    for k in ti.static(range(C)):
+        gradient[COLOR + k, i] = dcolor[k]
+
+
+@vector_instructions
 @ti.kernel
 def _project_forward(
     # inputs
-    means: ti.types.ndarray(ndim=2),  # [N, 3] metres, world
-    quats: ti.types.ndarray(ndim=2),  # [N, 4] wxyz, any norm
-    scales: ti.types.ndarray(ndim=2),  # [N, 3] metres
-    opacities: ti.types.ndarray(ndim=1),  # [N]
-    colors: ti.types.ndarray(ndim=2),  # [N, C]
-    T_camera_world: ti.types.ndarray(ndim=2),  # [4, 4]
+    means: lanes(1),  # [3 G] the lanes of [padded, 3]
+    quats: lanes(1),  # [4 G]
+    scales: lanes(1),  # [3 G]
+    opacities: lanes(1),  # [G]
+    colors: lanes(1),  # [C G]
+    poses: ti.types.ndarray(ndim=3),  # [V, 4, 4] T_camera_world
     fx: float,
     fy: float,
     cx: float,
@@ -86,177 +248,257 @@ def _project_forward(
     height: ti.i32,
     tile: ti.i32,
     low_pass: float,  # px^2
+    num_workers: ti.i32,
     # outputs
-    record: ti.types.ndarray(ndim=2),  # [N, FEATURES + 1 + C]
-    depth_bits: ti.types.ndarray(ti.i32, ndim=1),  # [N] sorts as the depth, NOT_DRAWN where culled
-    packed_tiles: ti.types.ndarray(ti.i32, ndim=1),  # [N] tiles touched
-    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [N + 1] slots of Gaussian i: first_slot[i] .. [i + 1]
+    gaussians: lanes(2),  # [COLOR + C, G]
+    record: ti.types.ndarray(ndim=2),  # [V * padded, record_size(C)]
+    depth_bits: ti.types.ndarray(ti.i32, ndim=1),  # [V * padded] sorts as the depth, NOT_DRAWN where culled
+    packed_tiles: ti.types.ndarray(ti.i32, ndim=1),  # [V * padded] tiles touched
+    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [V * padded + 1] of every Gaussian, one slot a tile
+    C: ti.template(),
 ):
-    for i in range(means.shape[0]):
-        first_slot[i] = 0
-        depth_bits[i] = NOT_DRAWN
-        R_c, t_c = load_pose(T_camera_world)
-        p = R_c @ ti.Vector([means[i, 0], means[i, 1], means[i, 2]]) + t_c
-        if p[2] > NEAR:
-            inv_z = 1.0 / p[2]
-            u, v = fx * p[0] * inv_z + cx, fy * p[1] * inv_z + cy
-            # The affine approximation is useless far outside the image.
-            if -0.3 * width < u < 1.3 * width and -0.3 * height < v < 1.3 * height:
-                q, _ = load_quaternion(quats, i)
-                M = R_c @ rotation_of(q)
-                j02, j12 = -fx * p[0] * inv_z * inv_z, -fy * p[1] * inv_z * inv_z
-                cov_xx, cov_xy, cov_yy = low_pass, 0.0, low_pass
-                for k in ti.static(range(3)):
-                    a = (fx * inv_z * M[0, k] + j02 * M[2, k]) * scales[i, k]
-                    b = (fy * inv_z * M[1, k] + j12 * M[2, k]) * scales[i, k]
-                    cov_xx += a * a
-                    cov_xy += a * b
-                    cov_yy += b * b
-                inv_det = 1.0 / (cov_xx * cov_yy - cov_xy * cov_xy)
-                extent = ti.log(opacities[i] / MIN_ALPHA)  # alpha >= 1/255 <=> d^T K d <= 2 extent
-                if extent > 0 and inv_det > 0:
-                    record[i, MEAN_X], record[i, MEAN_Y] = u, v
-                    record[i, CONIC_XX] = cov_yy * inv_det
-                    record[i, CONIC_XY] = -cov_xy * inv_det
-                    record[i, CONIC_YY] = cov_xx * inv_det
-                    record[i, OPACITY] = opacities[i]
-                    record[i, EXTENT] = extent
-                    half_width, half_height = ti.sqrt(2 * extent * cov_xx), ti.sqrt(2 * extent * cov_yy)
-                    record[i, HALF_WIDTH], record[i, HALF_HEIGHT] = half_width, half_height
-                    record[i, FEATURES] = p[2]
-                    for k in range(colors.shape[1]):
-                        record[i, FEATURES + 1 + k] = colors[i, k]
-                    left, right = tiles_between(u - half_width, u + half_width, width, tile)
-                    top, bottom = tiles_between(v - half_height, v + half_height, height, tile)
-                    if left <= right and top <= bottom:
-                        first_slot[i] = (right - left + 1) * (bottom - top + 1)  # the number, for now
-                        packed_tiles[i] = pack_tiles(left, right, top, bottom)
-                        # positive floats sort as integers
-                        depth_bits[i] = ti.bit_cast(ti.cast(p[2], ti.f32), ti.i32)
+    groups = gaussians.shape[1]
+    for chunk in range(num_workers * CHUNK):
+        if chunk % CHUNK == 0:
+            w = chunk // CHUNK
+            for group in range(groups * w // num_workers, groups * (w + 1) // num_workers):
+                split_columns(means, group, gaussians, MEAN, QUAT - MEAN)
+                split_columns(quats, group, gaussians, QUAT, SCALE - QUAT)
+                split_columns(scales, group, gaussians, SCALE, OPACITY - SCALE)
+                split_columns(opacities, group, gaussians, OPACITY, COLOR - OPACITY)
+                split_columns(colors, group, gaussians, COLOR, C)
+                opacity = gaussians[OPACITY, group]
+                # alpha >= 1/255 <=> d^T K d <= 2 extent
+                extent = ti.Vector([ti.log(opacity[lane] / MIN_ALPHA) for lane in range(LANES)])
+                for v in range(poses.shape[0]):
+                    mean_x, mean_y, z, cov_xx, cov_xy, cov_yy = ellipses(
+                        gaussians, group, poses, v, fx, fy, cx, cy, low_pass
+                    )
+                    det = cov_xx * cov_yy - cov_xy * cov_xy
+                    is_near_image = (
+                        (mean_x > -MARGIN * width) & (mean_x < (1 + MARGIN) * width)
+                        & (mean_y > -MARGIN * height) & (mean_y < (1 + MARGIN) * height)
+                    )  # fmt: skip
+                    is_seen = (z > NEAR) & is_near_image & (extent > 0.0) & (det > 0.0)
+                    x, y = ti.select(is_seen, mean_x, 0.0), ti.select(is_seen, mean_y, 0.0)
+                    half_width = ti.sqrt(ti.select(is_seen, 2.0 * extent * cov_xx, 0.0))
+                    half_height = ti.sqrt(ti.select(is_seen, 2.0 * extent * cov_yy, 0.0))
+                    left, right = first_and_last(x - half_width, x + half_width, width)
+                    top, bottom = first_and_last(y - half_height, y + half_height, height)
+                    is_drawn = is_seen & (left <= right) & (top <= bottom)
+                    left, right = ti.floor(left / BLOCK), ti.floor(right / BLOCK)  # blocks from here on
+                    top, bottom = ti.floor(top / BLOCK), ti.floor(bottom / BLOCK)
+                    rows = ti.select(is_drawn, bottom - top + 1.0, 0.0)
+                    half = ti.select(is_drawn, 0.5 / det, 0.0)
+                    p, q, r = once(cov_yy * half), once((0.0 - 2.0) * cov_xy * half), once(cov_xx * half)
+                    first = (v * groups + group) * LANES
+                    # Of each row of blocks the ellipse reaches only some. Its rightmost point is at (w, s):
+                    # between rows a and b, it is the rightmost one at the height nearest to s, and
+                    # p x^2 + q x y + r y^2 = extent.
+                    slope = half_width * cov_xy / ti.select(is_drawn, cov_xx, 1.0)
+                    for row in range(ti.min(SPANS, ti.cast(largest(rows), ti.i32))):
+                        a = (top + row) * BLOCK - y
+                        b = a + (BLOCK - 1.0)
+                        a = ti.select(a > 0.0 - half_height, a, 0.0 - half_height)
+                        b = ti.select(b < half_height, b, half_height)
+                        low, high = (0.0 - slope), slope
+                        low = ti.select(low < a, a, low)
+                        low = ti.select(low > b, b, low)
+                        high = ti.select(high < a, a, high)
+                        high = ti.select(high > b, b, high)
+                        root_low = q * q * low * low - 4.0 * p * (r * low * low - extent)
+                        root_high = q * q * high * high - 4.0 * p * (r * high * high - extent)
+                        inverse = 0.5 / ti.select(is_drawn, p, 1.0)
+                        reach_low = (ti.sqrt(ti.select(root_low > 0.0, root_low, 0.0)) + q * low) * inverse
+                        reach_high = (
+                            ti.sqrt(ti.select(root_high > 0.0, root_high, 0.0)) - q * high
+                        ) * inverse
+                        begin, end = first_and_last(x - reach_low, x + reach_high, width)
+                        is_reached = is_drawn & (begin <= end)
+                        begin = ti.select(is_reached, ti.floor(begin / BLOCK), 1.0)
+                        columns = begin * HALF + ti.select(is_reached, ti.floor(end / BLOCK), 0.0)
+                        for lane in ti.static(range(LANES)):
+                            if rows[lane] > row:
+                                record[first + lane, ti.static(gradient_size(C)) + SPAN + row] = columns[lane]
+                    box_columns, box_rows = left * HALF + right, top * HALF + bottom
+                    across = tile // BLOCK
+                    tiles = [once(ti.floor(blocks / across)) for blocks in (left, right, top, bottom)]
+                    number = (tiles[1] - tiles[0] + 1.0) * (tiles[3] - tiles[2] + 1.0)
+                    for lane in ti.static(range(LANES)):
+                        g = first + lane
+                        first_slot[g] = 0
+                        depth_bits[g] = NOT_DRAWN
+                        if rows[lane] > 0:
+                            record[g, MEAN_X], record[g, MEAN_Y] = mean_x[lane], mean_y[lane]
+                            record[g, HALF_K_XX], record[g, K_XY] = p[lane], q[lane]
+                            record[g, HALF_K_YY], record[g, EXTENT] = r[lane], extent[lane]
+                            record[g, FEATURES] = z[lane]
+                            for k in ti.static(range(C)):
+                                record[g, FEATURES + 1 + k] = gaussians[COLOR + k, group][lane]
+                            record[g, ti.static(gradient_size(C)) + COLUMNS] = box_columns[lane]
+                            record[g, ti.static(gradient_size(C)) + ROWS] = box_rows[lane]
+                            packed_tiles[g] = ti.cast(tiles[0][lane], ti.i32)
+                            for k in ti.static(range(1, 4)):
+                                packed_tiles[g] = packed_tiles[g] << 8 | ti.cast(tiles[k][lane], ti.i32)
+                            first_slot[g] = ti.cast(number[lane], ti.i32)  # not yet summed up
+                            # positive floats sort as integers
+                            depth_bits[g] = ti.bit_cast(ti.cast(z[lane], ti.f32), ti.i32)
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
-        for i in range(means.shape[0]):
-            number = first_slot[i]
-            first_slot[i] = total
-            total += number
-        first_slot[means.shape[0]] = total
+        for g in range(depth_bits.shape[0]):
+            count = first_slot[g]
+            first_slot[g] = total
+            total += count
+        first_slot[depth_bits.shape[0]] = total
 
 
+@vector_instructions
 @ti.kernel
 def _project_backward(
     # inputs
-    means: ti.types.ndarray(ndim=2),  # [N, 3]
-    quats: ti.types.ndarray(ndim=2),  # [N, 4]
-    scales: ti.types.ndarray(ndim=2),  # [N, 3]
-    T_camera_world: ti.types.ndarray(ndim=2),  # [4, 4]
+    gaussians: lanes(2),  # [COLOR + C, groups]
+    poses: ti.types.ndarray(ndim=3),  # [V, 4, 4]
     fx: float,
     fy: float,
-    record: ti.types.ndarray(ndim=2),  # [N, FEATURES + 1 + C]
-    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [N + 1] slots of Gaussian i: first_slot[i] .. [i + 1]
-    slot_grad: ti.types.ndarray(ndim=2),  # [slots, GRADIENT_FEATURES + 1 + C] one row per (Gaussian, tile)
+    low_pass: float,
+    num_workers: ti.i32,
+    first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [V * padded + 1]
+    slot_grad: sums(2),  # [slots, rows / SUMS] GRAD_FEATURES + 1 + C numbers of every (Gaussian, tile)
+    # scratch, twice the same memory
+    gradient_2d: ti.types.ndarray(ndim=2),  # [gradient_size(C) + 1, V * padded]
+    gradient_2d_lanes: lanes(2),  # [gradient_size(C) + 1, V * groups]
     # outputs
-    grad_means: ti.types.ndarray(ndim=2),  # [N, 3]
-    grad_quats: ti.types.ndarray(ndim=2),  # [N, 4]
-    grad_scales: ti.types.ndarray(ndim=2),  # [N, 3]
-    grad_opacities: ti.types.ndarray(ndim=1),  # [N]
-    grad_colors: ti.types.ndarray(ndim=2),  # [N, C]
-    grad_pose: ti.types.ndarray(ndim=2),  # [parts, 12] rows of [dR | dt], to be summed over parts
+    gradient: lanes(2),  # [COLOR + C, groups]
+    grad_means: lanes(1),  # [3 G] the lanes of [padded, 3]
+    grad_quats: lanes(1),  # [4 G]
+    grad_scales: lanes(1),  # [3 G]
+    grad_opacities: lanes(1),  # [G]
+    grad_colors: lanes(1),  # [C G]
+    pose_parts: lanes(3),  # [V, parts, 12] rows of [dR | dt], zeros in, to be summed over parts and lanes
     C: ti.template(),
 ):
-    parts = grad_pose.shape[0]
-    n = ti.cast(means.shape[0], ti.i64)
-    for part in range(parts):
-        R_c, t_c = load_pose(T_camera_world)
-        dR_c = ti.Matrix([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        dt_c = ti.Vector([0.0, 0.0, 0.0])
-        for i in range(ti.cast(n * part // parts, ti.i32), ti.cast(n * (part + 1) // parts, ti.i32)):
-            g = ti.Vector([0.0 for _ in range(GRADIENT_FEATURES + 1)])
-            dcolor = ti.Vector([0.0 for _ in range(C)])
-            for s in range(first_slot[i], first_slot[i + 1]):
-                for k in ti.static(range(GRADIENT_FEATURES + 1)):
-                    g[k] += slot_grad[s, k]
-                for k in ti.static(range(C)):
-                    dcolor[k] += slot_grad[s, GRADIENT_FEATURES + 1 + k]
-            for k in ti.static(range(C)):
-                grad_colors[i, k] = dcolor[k]
-            grad_opacities[i] = g[OPACITY]
-            dmean, dscale = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
-            dquat = ti.Vector([0.0, 0.0, 0.0, 0.0])
-            if first_slot[i + 1] > first_slot[i]:
-                K = ti.Matrix(
-                    [
-                        [record[i, CONIC_XX], record[i, CONIC_XY]],
-                        [record[i, CONIC_XY], record[i, CONIC_YY]],
-                    ]
-                )
-                half = 0.5 * g[CONIC_XY]  # K_xy stands twice in the symmetric matrix
-                dK = ti.Matrix([[g[CONIC_XX], half], [half, g[CONIC_YY]]])
-                dS = -(K @ dK @ K)  # from K = S'^-1
-                mean = ti.Vector([means[i, 0], means[i, 1], means[i, 2]])
-                p = R_c @ mean + t_c
-                inv_z = 1.0 / p[2]
-                q, norm = load_quaternion(quats, i)
-                R = rotation_of(q)
-                M = R_c @ R
-                j00, j11 = fx * inv_z, fy * inv_z
-                j02, j12 = -fx * p[0] * inv_z * inv_z, -fy * p[1] * inv_z * inv_z
-                dM = ti.Matrix([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-                dj00, dj11, dj02, dj12 = 0.0, 0.0, 0.0, 0.0
-                for k in ti.static(range(3)):
-                    # S' = sum_k a_k a_k^T with 2-vectors a_k = s_k (J M)_k, so da_k = 2 dS a_k
-                    jm_a, jm_b = j00 * M[0, k] + j02 * M[2, k], j11 * M[1, k] + j12 * M[2, k]
-                    s = scales[i, k]
-                    da = 2 * s * (dS[0, 0] * jm_a + dS[0, 1] * jm_b)
-                    db = 2 * s * (dS[1, 0] * jm_a + dS[1, 1] * jm_b)
-                    dscale[k] = da * jm_a + db * jm_b
-                    da, db = da * s, db * s
-                    dM[0, k], dM[1, k], dM[2, k] = da * j00, db * j11, da * j02 + db * j12
-                    dj00 += da * M[0, k]
-                    dj02 += da * M[2, k]
-                    dj11 += db * M[1, k]
-                    dj12 += db * M[2, k]
-                # p enters through the mean (u, v), the depth, and J.
-                inv_z2, inv_z3 = inv_z * inv_z, inv_z * inv_z * inv_z
-                dp = ti.Vector(
-                    [
-                        g[MEAN_X] * fx * inv_z - dj02 * fx * inv_z2,
-                        g[MEAN_Y] * fy * inv_z - dj12 * fy * inv_z2,
-                        g[GRADIENT_FEATURES]
-                        - (g[MEAN_X] * fx * p[0] + g[MEAN_Y] * fy * p[1]) * inv_z2
-                        - (dj00 * fx + dj11 * fy) * inv_z2
-                        + 2 * inv_z3 * (fx * p[0] * dj02 + fy * p[1] * dj12),
-                    ]
-                )
-                dmean = R_c.transpose() @ dp  # p = R_c mu + t_c
-                dt_c += dp
-                dR_c += dp.outer_product(mean) + dM @ R.transpose()  # M = R_c R
-                dR = R_c.transpose() @ dM
-                w, x, y, z = q[0], q[1], q[2], q[3]
-                dunit = 2 * ti.Vector(
-                    [
-                        x * (dR[2, 1] - dR[1, 2]) + y * (dR[0, 2] - dR[2, 0]) + z * (dR[1, 0] - dR[0, 1]),
-                        -2 * x * (dR[1, 1] + dR[2, 2])
-                        + y * (dR[1, 0] + dR[0, 1])
-                        + z * (dR[2, 0] + dR[0, 2])
-                        + w * (dR[2, 1] - dR[1, 2]),
-                        x * (dR[1, 0] + dR[0, 1])
-                        - 2 * y * (dR[0, 0] + dR[2, 2])
-                        + z * (dR[2, 1] + dR[1, 2])
-                        + w * (dR[0, 2] - dR[2, 0]),
-                        x * (dR[2, 0] + dR[0, 2])
-                        + y * (dR[2, 1] + dR[1, 2])
-                        - 2 * z * (dR[0, 0] + dR[1, 1])
-                        + w * (dR[1, 0] - dR[0, 1]),
-                    ]
-                )
-                dquat = (dunit - q * q.dot(dunit)) / norm  # through the normalisation
-            for k in ti.static(range(3)):
-                grad_means[i, k] = dmean[k]
-                grad_scales[i, k] = dscale[k]
-            for k in ti.static(range(4)):
-                grad_quats[i, k] = dquat[k]
-        for a in ti.static(range(3)):
-            for b in ti.static(range(3)):
-                grad_pose[part, 4 * a + b] = dR_c[a, b]
-            grad_pose[part, 4 * a + 3] = dt_c[a]
+    for chunk in range(num_workers * CHUNK):
+        if chunk % CHUNK == 0:
+            w, n = chunk // CHUNK, first_slot.shape[0] - 1
+            for g in range(n * w // num_workers, n * (w + 1) // num_workers):
+                first, past = first_slot[g], first_slot[g + 1]
+                for k in ti.static(range(gradient_size(C) // SUMS)):
+                    total = ti.Vector([0.0 for _ in range(SUMS)])
+                    for s in range(first, past):
+                        total += slot_grad[s, k]
+                    for j in ti.static(range(SUMS)):
+                        gradient_2d[SUMS * k + j, g] = total[j]
+                gradient_2d[ti.static(gradient_size(C)), g] = ti.select(past > first, 1.0, 0.0)
+    for chunk in range(num_workers * CHUNK):
+        if chunk % CHUNK == 0:
+            w, parts = chunk // CHUNK, pose_parts.shape[1]
+            for part in range(parts * w // num_workers, parts * (w + 1) // num_workers):
+                for group in range(part * PART, ti.min((part + 1) * PART, gaussians.shape[1])):
+                    differentiate(
+                        gaussians, group, poses, fx, fy, low_pass, gradient_2d_lanes,
+                        gradient, pose_parts, part, C,
+                    )  # fmt: skip
+                    join_columns(gradient, MEAN, QUAT - MEAN, group, grad_means)
+                    join_columns(gradient, QUAT, SCALE - QUAT, group, grad_quats)
+                    join_columns(gradient, SCALE, OPACITY - SCALE, group, grad_scales)
+                    join_columns(gradient, OPACITY, COLOR - OPACITY, group, grad_opacities)
+                    join_columns(gradient, COLOR, C, group, grad_colors)
+
+
+@dataclass(frozen=True)
+class Projection:
+    """One map as several views see it; index v * padded + i is Gaussian i in view v."""
+
+    count: int  # Gaussians
+    gaussians: Tensor  # [COLOR + C, G, LANES]
+    poses: Tensor  # [V, 4, 4]
+    intrinsics: tuple[float, float, float, float]
+    low_pass: float
+    record: Tensor  # [V * padded, record_size(C)]
+    depth_bits: Tensor  # [V * padded] int32
+    packed_tiles: Tensor  # [V * padded] int32 tiles touched
+    first_slot: Tensor  # [V * padded + 1] int32
+
+    @property
+    def channels(self) -> int:
+        return len(self.gaussians) - COLOR
+
+    @property
+    def padded(self) -> int:
+        """Number of Gaussians, rounded up to full lanes."""
+        return self.gaussians.shape[1] * LANES
+
+
+def padded_to_lanes(name: str, table: Tensor) -> Tensor:  # [N, ...] -> [padded, ...]
+    """Return the table, ready for a kernel, with rows of zeros up to a multiple of LANES."""
+    missing = -len(table) % LANES
+    table = plain(name, table)
+    return torch.cat([table, table.new_zeros(missing, *table.shape[1:])]) if missing else table
+
+
+def by_lanes(table: Tensor) -> Tensor:  # [padded, ...] -> [K, LANES]
+    """Return the numbers of a table as kernels take it whose arguments are `lanes(1)`."""
+    return table.view(table.numel() // LANES, LANES)
+
+
+def by_sums(table: Tensor) -> Tensor:  # [N, K SUMS] -> [N, K, SUMS]
+    """Return a table as kernels take it whose arguments are `sums(2)`."""
+    return table.view(len(table), table.shape[1] // SUMS, SUMS)
+
+
+def project(
+    means: Tensor,  # [N, 3] metres, world
+    quats: Tensor,  # [N, 4] wxyz, any norm
+    scales: Tensor,  # [N, 3] metres
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [N, C]
+    poses: Tensor,  # [V, 4, 4] T_camera_world
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],  # (width, height)
+    tile: int,
+    low_pass: float,
+) -> Projection:
+    """Project every Gaussian into every view, and find the tiles it touches there."""
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    tables = [padded_to_lanes(name, table) for name, table in named.items()]  # filled up with opacity 0
+    channels, padded, device = colors.shape[1], len(tables[0]), means.device
+    n = len(poses) * padded
+
+    def integers(*shape: int) -> Tensor:
+        return torch.empty(shape, dtype=torch.int32, device=device)
+
+    gaussians = torch.empty(COLOR + channels, padded // LANES, LANES, dtype=float_dtype(), device=device)
+    record = gaussians.new_empty(n, record_size(channels))
+    depth_bits, packed_tiles, first_slot = integers(n), integers(n), integers(n + 1)
+    _project_forward(
+        *[by_lanes(table) for table in tables],
+        poses, *intrinsics, *size, tile, low_pass, workers(),
+        gaussians, record, depth_bits, packed_tiles, first_slot, channels,
+    )  # fmt: skip
+    return Projection(
+        len(means), gaussians, poses, intrinsics, low_pass, record, depth_bits, packed_tiles, first_slot
+    )
+
+
+def project_backward(
+    projection: Projection,
+    slot_grad: Tensor,  # [slots, gradient_size(C)]
+) -> tuple[list[Tensor], Tensor]:
+    """Return the gradients of means, quats, scales, opacities and colours, and of the poses [V, 4, 4]."""
+    gaussians, poses, channels = projection.gaussians, projection.poses, projection.channels
+    num_views, groups, padded = len(poses), gaussians.shape[1], projection.padded
+    rows = gradient_size(channels)
+    gradient_2d = gaussians.new_empty(rows + 1, num_views * padded)
+    parts = gaussians.new_zeros(num_views, max(-(-groups // PART), 1), 12, LANES)
+    gradients = [gaussians.new_empty(padded, *shape) for shape in ((3,), (4,), (3,), (), (channels,))]
+    fx, fy, _, _ = projection.intrinsics
+    _project_backward(
+        gaussians, poses, fx, fy, projection.low_pass, workers(),
+        projection.first_slot, by_sums(slot_grad),
+        gradient_2d, gradient_2d.view(rows + 1, num_views * groups, LANES), torch.empty_like(gaussians),
+        *[by_lanes(gradient) for gradient in gradients], parts, channels,
+    )  # fmt: skip
+    grad_poses = torch.zeros_like(poses)
+    grad_poses[:, :3] = parts.sum((1, 3), dtype=torch.float64).view(num_views, 3, 4).to(poses.dtype)
+    return [gradient[: projection.count] for gradient in gradients], grad_poses
