@@ -1,82 +1,81 @@
 """python apps/benchmark.py --suites rasterizer tracking
 
-Time the kernels beside alternatives (torch, numpy) in turn in one process, and print a Markdown table.
---out FOLDER also writes benchmark.md and benchmark.json there.
+Time the kernels, and steps of a run, beside alternatives (torch, numpy, and numba and dv-processing where
+installed) in turn in one process, and print a Markdown table; "limit" is the least time this machine could
+take. --out FOLDER also writes benchmark.md and benchmark.json there, and scaling.png for the suite `scaling`.
 """
 
-import dataclasses
-import json
-import os
-import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from edslam_ti.command_line import launch, parse_arguments
+from edslam_ti.errors import EdSlamError
 
-Suite = Literal["rasterizer", "time_surface", "tracking"]
-
-
-def processor() -> str:
-    """Return the processor's name, where Linux tells it, and the number of its cores."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+Suite = Literal["time_surface", "tracking", "rasterizer", "mapping_step", "slam", "scaling"]
+KERNELS: tuple[Suite, ...] = ("time_surface", "tracking", "rasterizer", "mapping_step")
+HEADER = (
+    "| task | | wall ms | CPU ms | wall / first | CPU / first | limit ms |\n|---|---|--:|--:|--:|--:|--:|"
+)
 
 
 def benchmark(
-    suites: tuple[Suite, ...] = ("rasterizer", "time_surface", "tracking"),
+    suites: tuple[Suite, ...] = KERNELS,
     sizes: tuple[tuple[int, int], ...] = ((384, 240),),
     gaussians: tuple[int, ...] = (30_000,),
     events: tuple[int, ...] = (10_000, 1_000_000),
     rounds: int = 7,
     threads: int = 2,
+    device: Literal["cpu", "cuda"] = "cpu",
+    scene: str = "office0",
+    duration: float = 1.0,
     out: Path | None = None,
 ) -> None:
-    """Time the kernels on the CPU.
+    """Time the kernels and what is built of them.
 
     Args:
-        suites: what to time
+        suites: what to time; scaling: cost against each size, and against 1 to `threads` threads
         sizes: widths and heights of images, in pairs
         gaussians: numbers of Gaussians
         events: numbers of events in a batch
         rounds: timings of each candidate, of which the median counts
         threads: CPU threads of the kernels and of torch
-        out: folder that receives benchmark.md and benchmark.json
+        device: where the kernels run; alternatives stay on the CPU
+        scene: sequence of the suite slam
+        duration: seconds of it
+        out: folder that receives the results
     """
     import torch  # torch and Taichi take seconds to load
 
     import kernels
+    from edslam_ti import benchmark as steps
     from kernels import benchmark as timed
 
-    kernels.init("cpu", threads=threads)
+    try:
+        kernels.init(device, threads=threads)
+    except RuntimeError as error:  # no such device
+        raise EdSlamError(str(error)) from error
     torch.set_num_threads(threads)
-    machine = f"{processor()}, {threads} threads, torch {torch.__version__}"
-
-    def rows() -> Iterator[timed.Row]:
-        for size in sizes:
-            for count in gaussians if "rasterizer" in suites else ():
-                yield from timed.rasterizer(size, count, rounds)
-            for count in events if "time_surface" in suites else ():
-                yield from timed.surface(size, count, rounds)
-            if "tracking" in suites:
-                yield from timed.tracking(size, rounds)
-
-    lines = [f"{machine}; medians of {rounds}", ""]
-    lines += ["| task | | wall ms | CPU ms | wall / ours |", "|---|---|--:|--:|--:|"]
+    watch = timed.Stopwatch(rounds)
+    machine = f"{timed.processor()}, {threads} threads, torch {torch.__version__}, kernels on {device}"
+    limits = f"{watch.bytes_per_second / 1e9:.3g} GB/s copied, {watch.flops_per_second / 1e9:.3g} GFLOP/s"
+    lines = [f"{machine}; medians of {rounds}; {limits}", ""]
+    lines += [HEADER] if set(suites) - {"scaling"} else []
     print("\n".join(lines))
     results = []
-    for row in rows():
-        results.append(dataclasses.asdict(row))
-        times = f"{row.wall_ms:.3g} | {row.cpu_ms:.3g} | {row.times_ours:.2f}"
-        lines.append(f"| {row.task} | {row.name} | {times} |")
+    for row in steps.rows(suites, sizes, gaussians, events, (scene, duration), watch, device):
+        results.append(row)
+        lines.append(row.as_markdown())
         print(lines[-1], flush=True)
+    curves: list[steps.Curve] = []
+    if "scaling" in suites:
+        alone = timed.Stopwatch(rounds, has_alternatives=False)
+        curves += steps.scaling(sizes, gaussians, events, range(1, threads + 1), alone)
+        table = steps.scaling_table(curves)
+        lines += table
+        print("\n".join(table))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "benchmark.md").write_text("\n".join(lines) + "\n")
-        content = json.dumps({"machine": machine, "rows": results}, indent=2)
-        (out / "benchmark.json").write_text(content + "\n")
+        steps.write(out, machine, lines, results, curves)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -1,24 +1,34 @@
-"""Kernels timed in turn with alternatives that compute the same: torch, numpy.
+"""Kernels timed in turn with alternatives that compute the same: torch, numpy, and others where installed.
 
 Everything runs in one process, one candidate after the other in every round, so that whatever else the
-machine does hits all of them; medians of the rounds. CPU time counts all threads.
+machine does hits all of them; medians of the rounds. CPU time counts all threads. The least time that the
+machine could take follows from the bytes that must be moved and the operations that must be done, and from
+the bandwidth and the rate that torch reaches here.
 """
 
+import importlib.util
+import os
+import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import taichi as ti
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from kernels import reference
 from kernels.patch_warp import (
     NEAR,
+    Alignment,
+    Direction,
     Patches,
     ResidualModel,
+    adjoint,
     extract_patches,
-    normal_equations,
 )
 from kernels.projection import MIN_ALPHA
 from kernels.rasterization import MAX_ALPHA, MIN_TRANSMITTANCE, rasterize
@@ -26,10 +36,22 @@ from kernels.time_surface import time_surface, update_last_timestamps
 
 OURS = "Taichi"
 TWIN_LIMIT = 3e7  # Gaussians times pixels that the torch twin still manages, all at once
+DV_LIMIT = 2_000_000  # events: dv-processing takes them from Python one by one
 NUM_PATCHES, PATCH_SIZE = 400, 9
+# Floating point operations, counted in the formulas
+FLOPS_FORWARD, FLOPS_BACKWARD = 30, 48  # of a (pixel, Gaussian) pair
+FLOPS_LINEARISE = 230  # of a patch pixel: warp, two samples, two Jacobians, 2 x 27 sums
 
-Candidates = dict[str, Callable[[], object]]
+Candidates = Mapping[str, Callable[[], object]]
 Scene = tuple[list[Tensor], tuple[float, float, float, float]]  # inputs of `rasterize`, intrinsics
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a task cannot do without."""
+
+    num_bytes: float = 0.0
+    flops: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -41,21 +63,77 @@ class Row:
     name: str
     wall_ms: float
     cpu_ms: float
-    times_ours: float  # wall time in units of ours
+    wall_times_ours: float  # wall time in units of ours
+    cpu_times_ours: float
+    limit_ms: float | None  # the least that the machine could take; None: not counted
+
+    def as_markdown(self) -> str:
+        """Return the row of a table: task, name, wall and CPU ms, both in units of ours, limit ms."""
+        times = (
+            f"{self.wall_ms:.3g} | {self.cpu_ms:.3g} | {self.wall_times_ours:.2f} | {self.cpu_times_ours:.2f}"
+        )
+        limit = "" if self.limit_ms is None else f"{self.limit_ms:.2g}"
+        return f"| {self.task} | {self.name} | {times} | {limit} |"
 
 
-def measure(suite: str, task: str, candidates: Candidates, rounds: int) -> list[Row]:
-    """Return the medians of all candidates; the first call of each is not counted."""
-    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in candidates}
-    for k in range(rounds + 1):
-        for name, run in candidates.items():
-            wall, cpu = time.perf_counter(), time.process_time()
+def processor() -> str:
+    """Return the processor's name, where Linux tells it, and the number of its cores."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+
+
+class Stopwatch:
+    """Times candidates in turn, on a machine whose limits it has measured; or the first of them alone."""
+
+    def __init__(self, rounds: int, has_alternatives: bool = True) -> None:
+        self._rounds = rounds
+        self.has_alternatives = has_alternatives
+        source, target = torch.ones(1 << 25), torch.empty(1 << 25)  # 128 MiB each
+        matrix = torch.ones(1536, 1536)
+        copying = self._best(lambda: target.copy_(source))
+        multiplying = self._best(lambda: matrix @ matrix)
+        self.bytes_per_second = 2 * source.numel() * source.element_size() / copying
+        self.flops_per_second = 2 * len(matrix) ** 3 / multiplying
+
+    def _best(self, run: Callable[[], object]) -> float:
+        seconds = []
+        for _ in range(max(3, self._rounds)):
+            started = time.perf_counter()
             run()
-            if k > 0:
-                samples[name].append((time.perf_counter() - wall, time.process_time() - cpu))
-    medians = {name: 1e3 * np.median(values, axis=0) for name, values in samples.items()}
-    ours = medians[OURS][0]
-    return [Row(suite, task, name, float(w), float(c), float(w / ours)) for name, (w, c) in medians.items()]
+            seconds.append(time.perf_counter() - started)
+        return min(seconds)
+
+    def compare(self, suite: str, task: str, candidates: Candidates, work: Work | None = None) -> list[Row]:
+        """Return the medians of all candidates; the first call of each is not counted."""
+        if not self.has_alternatives:
+            candidates = dict(list(candidates.items())[:1])
+        samples: dict[str, list[tuple[float, float]]] = {name: [] for name in candidates}
+        for k in range(self._rounds + 1):
+            for name, run in candidates.items():
+                _finish_device()
+                wall, cpu = time.perf_counter(), time.process_time()
+                run()
+                _finish_device()
+                if k > 0:
+                    samples[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+        medians = {name: 1e3 * np.median(values, axis=0) for name, values in samples.items()}
+        wall_ours, cpu_ours = medians[next(iter(medians))]
+        limit = None
+        if work is not None:
+            limit = 1e3 * max(work.num_bytes / self.bytes_per_second, work.flops / self.flops_per_second)
+        return [
+            Row(suite, task, name, float(w), float(c), float(w / wall_ours), float(c / cpu_ours), limit)
+            for name, (w, c) in medians.items()
+        ]
+
+
+def _finish_device() -> None:
+    """Wait for what was launched; a CPU has finished already."""
+    if ti.cfg.arch == ti.cuda:
+        ti.sync()
+        torch.cuda.synchronize()
 
 
 # --- rasterizer ---
@@ -115,10 +193,22 @@ def rasterize_pairs(
     return image, depth[..., 0], total[..., 0]
 
 
-def rasterizer(size: tuple[int, int], count: int, rounds: int) -> Iterator[Row]:
+def count_pairs(inputs: list[Tensor], intrinsics: tuple[float, ...], size: tuple[int, int]) -> int:
+    """Return how many (pixel, Gaussian) pairs the Gaussians in view have, hidden ones included."""
+    means, quats, scales, opacities, _, pose = inputs
+    centres, covariances, depths = reference.project(means, quats, scales, pose, intrinsics)
+    in_view = (depths > NEAR) & ((centres >= 0) & (centres < torch.tensor(size))).all(1)
+    extent = torch.log(opacities / MIN_ALPHA).clamp_min(0)
+    area = 2 * torch.pi * extent * torch.linalg.det(covariances).clamp_min(0).sqrt()
+    return int(area[in_view].sum())
+
+
+def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str = "cpu") -> Iterator[Row]:
     """Render a view; render it and compute all gradients, pose included."""
     inputs, intrinsics = room_scene(count, *size)
-    cotangent = torch.randn(size[1], size[0], generator=torch.Generator().manual_seed(0))
+    pairs = count_pairs(inputs, intrinsics, size)
+    inputs = [x.to(device) for x in inputs]
+    cotangent = torch.randn(size[1], size[0], generator=torch.Generator().manual_seed(0)).to(device)
 
     def kernel(*tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         view = rasterize(*tensors, intrinsics, size)
@@ -133,21 +223,27 @@ def rasterizer(size: tuple[int, int], count: int, rounds: int) -> Iterator[Row]:
         loss = sum((image.squeeze(-1) * cotangent).sum() for image in render(*tensors))
         return torch.autograd.grad(loss, tensors)
 
-    renders = {OURS: kernel, "torch pair list": lambda *x: rasterize_pairs(*x, intrinsics, size)}
-    if size[0] * size[1] * count <= TWIN_LIMIT:
-        renders["torch twin"] = twin
+    renders = {OURS: kernel}
+    if device == "cpu":  # the alternatives make tensors on the CPU
+        renders["torch pair list"] = lambda *x: rasterize_pairs(*x, intrinsics, size)
+        if size[0] * size[1] * count <= TWIN_LIMIT:
+            renders["torch twin"] = twin
     task = f"{size[0]}x{size[1]}, {count} Gaussians"
+    values = sum(x.numel() for x in inputs)
+    pixels = 3 * size[0] * size[1]
     with torch.no_grad():
         forward = {name: lambda render=render: render(*inputs) for name, render in renders.items()}
-        yield from measure("rasterizer", f"{task}: render", forward, rounds)
+        work = Work(4 * (values + pixels), FLOPS_FORWARD * pairs)
+        yield from watch.compare("rasterizer", f"{task}: render", forward, work)
     both = {name: lambda render=render: gradients(render) for name, render in renders.items()}
-    yield from measure("rasterizer", f"{task}: render and gradients", both, rounds)
+    work = Work(8 * (values + pixels), (FLOPS_FORWARD + FLOPS_BACKWARD) * pairs)
+    yield from watch.compare("rasterizer", f"{task}: render and gradients", both, work)
 
 
 # --- time surface ---
 
 
-def surface(size: tuple[int, int], count: int, rounds: int) -> Iterator[Row]:
+def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
     """Take in a batch of events; evaluate the surface."""
     rng = np.random.default_rng(0)
     x = rng.integers(0, size[0], count).astype(np.int16)
@@ -158,14 +254,47 @@ def surface(size: tuple[int, int], count: int, rounds: int) -> Iterator[Row]:
     def assign() -> None:
         last[y, x] = t
 
+    updates = {
+        OURS: lambda: update_last_timestamps(x, y, t, last),
+        "numpy last[y, x] = t": assign,
+        "torch twin": lambda: reference.last_timestamps(*map(torch.from_numpy, (x, y, t)), last.shape),
+    }
+    if importlib.util.find_spec("numba"):
+        compiled = _numba_assignment()
+        updates["numba"] = lambda: compiled(x, y, t, last)
+    if watch.has_alternatives and importlib.util.find_spec("dv_processing") and count <= DV_LIMIT:
+        updates["dv-processing"] = _dv_update(x, y, t, size)
     task = f"{size[0]}x{size[1]}, {count} events"
-    updates = {OURS: lambda: update_last_timestamps(x, y, t, last), "numpy last[y, x] = t": assign}
-    yield from measure("time_surface", f"{task}: update", updates, rounds)
+    event_bytes = sum(array.itemsize for array in (x, y, t))
+    work = Work(event_bytes * count + last.nbytes)
+    yield from watch.compare("time_surface", f"{task}: update", updates, work)
     evaluations = {
         OURS: lambda: time_surface(last, 1.0, 0.03),
-        "numpy exp": lambda: np.exp(((last - 1.0) / 0.03).astype(np.float32)),
+        "torch twin": lambda: reference.time_surface(torch.from_numpy(last), 1.0, 0.03),
     }
-    yield from measure("time_surface", f"{task}: evaluate", evaluations, rounds)
+    work = Work(last.nbytes + last.nbytes // 2, 20 * last.size)
+    yield from watch.compare("time_surface", f"{task}: evaluate", evaluations, work)
+
+
+def _numba_assignment() -> Callable[..., None]:
+    import numba
+
+    @numba.njit
+    def assign(x: np.ndarray, y: np.ndarray, t: np.ndarray, last: np.ndarray) -> None:
+        for i in range(len(t)):
+            last[y[i], x[i]] = t[i]
+
+    return assign
+
+
+def _dv_update(x: np.ndarray, y: np.ndarray, t: np.ndarray, size: tuple[int, int]) -> Callable[[], None]:
+    import dv_processing
+
+    store = dv_processing.EventStore()
+    for event in zip((1e6 * t).astype(np.int64).tolist(), x.tolist(), y.tolist()):
+        store.push_back(*event, True)
+    surface = dv_processing.TimeSurface(size)
+    return lambda: surface.accept(store)
 
 
 # --- tracking ---
@@ -221,6 +350,42 @@ def linearise_in_numpy(
     return H, g
 
 
+def linearise_in_torch(
+    patches: Patches, surface: np.ndarray, depth: np.ndarray, T_b_a: np.ndarray,
+    intrinsics: tuple[float, ...], model: ResidualModel, inverse: bool,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """The same from the torch twin's residuals, by forward differentiation along the six twists."""
+    arrays = (patches.pixels, patches.values, surface, depth)
+    inputs, T = [torch.from_numpy(array) for array in arrays], torch.from_numpy(T_b_a).float()
+    columns: tuple[list[Tensor], list[Tensor]] = ([], [])
+    residuals: tuple[Tensor, ...] = ()
+    for generator in torch.from_numpy(_GENERATORS).float():
+        with forward_ad.dual_level():
+            moved = forward_ad.make_dual(T, -T @ generator if inverse else generator @ T)
+            duals = [
+                forward_ad.unpack_dual(r)
+                for r in reference.alignment_residuals(*inputs, moved, intrinsics, model)
+            ]
+            residuals = tuple(dual.primal for dual in duals)
+            for column, dual in zip(columns, duals):
+                column.append(torch.zeros_like(dual.primal) if dual.tangent is None else dual.tangent)
+    H, g = torch.zeros(6, 6), torch.zeros(6)
+    for r, column, share in zip(residuals, columns, (1.0, model.depth_weight)):
+        J = torch.stack(column, -1)
+        weight = share * torch.clamp(model.huber_threshold / r.abs().clamp_min(1e-12), max=1.0)
+        H += J.T @ (weight[:, None] * J)
+        g += J.T @ (weight * r)
+    return H.double().numpy(), g.double().numpy()
+
+
+# d exp(xi) / d xi_k at 0, twists being (translation, rotation)
+_GENERATORS = np.zeros((6, 4, 4))
+for _k in range(3):
+    _i, _j = (_k + 1) % 3, (_k + 2) % 3
+    _GENERATORS[_k, _k, 3] = _GENERATORS[_k + 3, _j, _i] = 1
+    _GENERATORS[_k + 3, _i, _j] = -1
+
+
 def tracking_inputs(size: tuple[int, int]) -> tuple[Patches, np.ndarray, np.ndarray, np.ndarray]:
     """Patches of a view, surface and depth of the same view, and a small motion [4, 4]."""
     rng = np.random.default_rng(0)
@@ -233,17 +398,28 @@ def tracking_inputs(size: tuple[int, int]) -> tuple[Patches, np.ndarray, np.ndar
     return extract_patches(surface, depth, centres, PATCH_SIZE), surface, depth, T
 
 
-def tracking(size: tuple[int, int], rounds: int) -> Iterator[Row]:
-    """Linearise the alignment once, both directions."""
+def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
+    """Linearise the alignment once, both directions, as an iteration of the tracker does."""
     intrinsics, model = (0.8 * size[0], 0.8 * size[0], size[0] / 2, size[1] / 2), ResidualModel()
     patches, surface, depth, T = tracking_inputs(size)
+    direction = Direction(patches.points(intrinsics), 0, model)
+    alignment = Alignment([direction] * 2, np.stack([surface, depth], -1)[None], intrinsics)
+    poses = [T, np.linalg.inv(T)]
+
+    def linearise() -> object:
+        forward, backward = alignment.linearise(poses)
+        return forward + backward.transformed(-adjoint(poses[1]))
+
     arguments = [
         (patches, surface, depth, pose, intrinsics, model, inverse)
-        for pose, inverse in ((T, False), (np.linalg.inv(T), True))
+        for pose, inverse in zip(poses, (False, True))
     ]
     candidates = {
-        OURS: lambda: [normal_equations(*each) for each in arguments],
+        OURS: linearise,
         "numpy": lambda: [linearise_in_numpy(*each) for each in arguments],
+        "torch twin": lambda: [linearise_in_torch(*each) for each in arguments],
     }
     task = f"{size[0]}x{size[1]}, {NUM_PATCHES} patches of {PATCH_SIZE}x{PATCH_SIZE}: linearise"
-    yield from measure("tracking", task, candidates, rounds)
+    pixels = 2 * NUM_PATCHES * PATCH_SIZE**2
+    work = Work(16 * pixels + surface.nbytes + depth.nbytes, FLOPS_LINEARISE * pixels)
+    yield from watch.compare("tracking", task, candidates, work)

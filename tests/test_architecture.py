@@ -31,7 +31,7 @@ RANKS: list[list[str]] = [
         *("edslam_ti.baselines.*", "edslam_ti.evaluation", "edslam_ti.surface_errors", "edslam_ti.export"),
         *("edslam_ti.pictures", "edslam_ti.visualization"),
     ],
-    ["edslam_ti.command_line", "edslam_ti.results", "edslam_ti.pipeline"],
+    ["edslam_ti.command_line", "edslam_ti.results", "edslam_ti.pipeline", "edslam_ti.benchmark"],
     [
         *("edslam_ti.reproduce", "edslam_ti.reproduce.cases", "edslam_ti.reproduce.altered"),
         *("edslam_ti.reproduce.recordings", "edslam_ti.reproduce.runs", "edslam_ti.reproduce.ablations"),
@@ -66,7 +66,9 @@ LIBRARIES: dict[str, list[str]] = {
     "skimage": ["edslam_ti.evaluation"],
     "kiss_icp": ["edslam_ti.baselines.*"],
     "lpips": ["edslam_ti.evaluation"],
-    "matplotlib": ["edslam_ti.pictures", "edslam_ti.visualization"],
+    "numba": ["kernels.benchmark"],
+    "dv_processing": ["kernels.benchmark"],
+    "matplotlib": ["edslam_ti.pictures", "edslam_ti.visualization", "edslam_ti.benchmark"],
     "rich": [
         "edslam_ti.datasets.*",
         "edslam_ti.results",

@@ -1,0 +1,265 @@
+"""Steps of a whole run timed beside alternatives, and how the kernels' cost grows with their input.
+
+The kernels alone are timed in kernels/benchmark.py; here are the steps that need a map or a sequence.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import kernels
+from edslam_ti.baselines import METHODS
+from edslam_ti.camera import Camera
+from edslam_ti.config import Config
+from edslam_ti.datasets import SampledSequence, open_sequence
+from edslam_ti.datasets.base import Sample
+from edslam_ti.gaussians import GaussianMap
+from edslam_ti.losses import brightness_change, event_loss
+from edslam_ti.output import atomic_file
+from edslam_ti.pipeline import make_slam
+from edslam_ti.rendering import render
+from edslam_ti.slam import Slam
+from kernels.benchmark import (
+    OURS,
+    Row,
+    Stopwatch,
+    rasterize_pairs,
+    rasterizer,
+    room_scene,
+    surface,
+    tracking,
+)
+
+WARM_UP_FRAMES = 3
+MOTION = (0.01, 0.0, 0.005)  # metres between the two views of a mapping step
+EPSILON, BACKGROUND = 0.004, 0.5
+
+
+def rows(
+    suites: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    gaussians: Sequence[int],
+    events: Sequence[int],
+    sequence: tuple[str, float],  # scene and seconds of it, for the suite slam
+    watch: Stopwatch,
+    device: str,
+) -> Iterator[Row]:
+    """Yield the rows of all suites."""
+    for size in sizes:
+        for count in events if "time_surface" in suites else ():
+            yield from surface(size, count, watch)
+        if "tracking" in suites:
+            yield from tracking(size, watch)
+        for count in gaussians:
+            if "rasterizer" in suites:
+                yield from rasterizer(size, count, watch, device)
+            if "mapping_step" in suites:
+                yield from mapping_step(size, count, watch)
+    if "slam" in suites:
+        yield from slam(*sequence)
+
+
+def write(
+    folder: Path, machine: str, lines: Sequence[str], results: Sequence[Row], curves: Sequence["Curve"]
+) -> None:
+    """Write benchmark.md and benchmark.json into the folder, and scaling.png if there are curves."""
+    content = {
+        "machine": machine,
+        "rows": [dataclasses.asdict(row) for row in results],
+        "curves": [dataclasses.asdict(curve) | {"exponent": curve.exponent} for curve in curves],
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_file(folder / "benchmark.md") as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    with atomic_file(folder / "benchmark.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+    if curves:
+        plot_scaling(folder / "scaling.png", curves)
+
+
+# --- mapping step ---
+
+
+def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
+    """Two views, event loss, gradients of the map and of both poses, Adam."""
+    (means, _, scales, _, colors, pose), intrinsics = room_scene(count, *size)
+    camera = Camera(*size, *intrinsics)
+    gaussians = GaussianMap(Config().mapping)
+    gaussians.add(means, scales, 0.7, colors)
+    starts = [torch.linalg.inv(pose).double(), torch.linalg.inv(pose).double()]
+    starts[1][:3, 3] += torch.tensor(MOTION)
+    measured = 0.1 * torch.randn(size[1], size[0], generator=torch.Generator().manual_seed(0))
+
+    def by_pairs(T_world_camera: torch.Tensor) -> torch.Tensor:
+        drawn = gaussians.activated()
+        image, _, alpha = rasterize_pairs(
+            drawn.means, drawn.quats, drawn.scales, drawn.opacities, drawn.colors,
+            torch.linalg.inv(T_world_camera).float(), intrinsics, size,
+        )  # fmt: skip
+        return image[..., 0] + (1 - alpha) * BACKGROUND
+
+    def by_kernels(T_world_camera: torch.Tensor) -> torch.Tensor:
+        return render(gaussians.activated(), camera, T_world_camera, BACKGROUND).intensity
+
+    def step(view: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        poses = [T.clone().requires_grad_() for T in starts]
+        predicted = brightness_change(view(poses[0]), view(poses[1]), EPSILON)
+        event_loss(predicted, measured).backward()
+        gaussians.step()
+
+    def renders(view: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        for T in starts:
+            image = view(T.clone().requires_grad_())
+            image.backward(measured)
+        for value in gaussians.raw.values():
+            value.grad = None
+
+    candidates = {
+        OURS: lambda: step(by_kernels),
+        "Taichi, its two renders with gradients": lambda: renders(by_kernels),
+        "torch pair list": lambda: step(by_pairs),
+    }
+    task = f"{size[0]}x{size[1]}, {count} Gaussians: mapping step"
+    yield from watch.compare("mapping_step", task, candidates)
+
+
+# --- whole runs ---
+
+COMPARED = ("ed_slam", "ed_slam_paper", "open3d_icp", "open3d_rgbd")
+
+
+def slam(scene: str, duration: float) -> Iterator[Row]:
+    """Frames of a sequence through several methods in turn: tracking alone, and ours with its mapping."""
+    base = Config(scene=scene, duration=duration)
+    sequence = open_sequence(base)
+    samples = SampledSequence(sequence, 0.0, duration, base.max_interval)
+    runs = {}
+    for method in COMPARED:
+        config = base.updated({"method": method, **METHODS[method].overrides})
+        config = config.updated({"mapping": {"enabled": False}})
+        runs[f"{method}, tracking"] = make_slam(config, sequence, samples)
+    runs["ed_slam, tracking and mapping"] = make_slam(base, sequence, samples)
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
+    for sample in samples:
+        for name, run in runs.items():
+            seconds[name].append(_timed(run, sample))
+    camera = sequence.camera
+    task = f"{scene}, {camera.width}x{camera.height}: one frame"
+    medians = {name: 1e3 * np.median(pairs[WARM_UP_FRAMES:], axis=0) for name, pairs in seconds.items()}
+    wall_ours, cpu_ours = next(iter(medians.values()))
+    for name, (wall, cpu) in medians.items():
+        yield Row(
+            "slam", task, name, float(wall), float(cpu), float(wall / wall_ours), float(cpu / cpu_ours), None
+        )
+
+
+def _timed(run: Slam, sample: Sample) -> tuple[float, float]:
+    wall, cpu = time.perf_counter(), time.process_time()
+    run.process(sample)
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+# --- how the cost grows ---
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Cost of one task against one size; `exponent` fits cost ~ size^exponent."""
+
+    task: str
+    against: str  # "pixels", "Gaussians", "events" or "threads"
+    sizes: list[float]
+    wall_ms: list[float]
+    cpu_ms: list[float]
+
+    @property
+    def exponent(self) -> float:
+        """Slope of a line through the logarithms, of wall time against threads and else of CPU time."""
+        cost = self.wall_ms if self.against == "threads" else self.cpu_ms
+        return float(np.polyfit(np.log(self.sizes), np.log(cost), 1)[0])
+
+
+def scaling(
+    sizes: Sequence[tuple[int, int]],
+    gaussians: Sequence[int],
+    events: Sequence[int],
+    threads: Sequence[int],
+    watch: Stopwatch,
+) -> Iterator[Curve]:
+    """Yield the kernels' cost against each size, the others at their middle; leaves the last threads."""
+    size, count, batch = sizes[len(sizes) // 2], gaussians[len(gaussians) // 2], events[len(events) // 2]
+
+    def curves(against: str, values: Sequence[float], rows: Callable[[int], list[Row]]) -> Iterator[Curve]:
+        columns = zip(*(rows(k) for k in range(len(values))))
+        for column in columns:
+            task = column[0].task.split(": ")[1]
+            walls, cpus = [row.wall_ms for row in column], [row.cpu_ms for row in column]
+            yield Curve(task, against, [float(v) for v in values], walls, cpus)
+
+    def with_threads(k: int) -> list[Row]:
+        kernels.init("cpu", threads=threads[k])
+        torch.set_num_threads(threads[k])
+        return [
+            *rasterizer(size, count, watch), *tracking(size, watch),
+            next(surface(size, max(events), watch)),
+        ]  # fmt: skip
+
+    yield from curves(
+        "pixels", [w * h for w, h in sizes],
+        lambda k: [
+            *rasterizer(sizes[k], count, watch), *mapping_step(sizes[k], count, watch),
+            *tracking(sizes[k], watch), *surface(sizes[k], batch, watch),
+        ],
+    )  # fmt: skip
+    yield from curves(
+        "Gaussians",
+        gaussians,
+        lambda k: [*rasterizer(size, gaussians[k], watch), *mapping_step(size, gaussians[k], watch)],
+    )
+    yield from curves("events", events, lambda k: [next(surface(size, events[k], watch))])
+    yield from curves("threads", threads, with_threads)
+
+
+def scaling_table(curves: Sequence[Curve]) -> list[str]:
+    """Return the curves as lines of a Markdown table."""
+    lines = ["| task | against | from | to | CPU ms | wall ms | exponent |", "|---|---|--:|--:|---|---|--:|"]
+    for curve in curves:
+        cpu, wall = (", ".join(f"{v:.3g}" for v in values) for values in (curve.cpu_ms, curve.wall_ms))
+        ends = f"{curve.sizes[0]:.0f} | {curve.sizes[-1]:.0f}"
+        lines.append(f"| {curve.task} | {curve.against} | {ends} | {cpu} | {wall} | {curve.exponent:.2f} |")
+    return lines
+
+
+def plot_scaling(path: Path, curves: Sequence[Curve]) -> None:
+    """Write a picture of all curves: a panel for each size, both axes logarithmic."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    kinds = list(dict.fromkeys(curve.against for curve in curves))
+    figure, panels = plt.subplots(1, len(kinds), figsize=(4 * len(kinds), 4), squeeze=False)
+    for kind, panel in zip(kinds, panels[0]):
+        shown = [curve for curve in curves if curve.against == kind]
+        for curve in shown:
+            cost = curve.wall_ms if kind == "threads" else curve.cpu_ms
+            panel.loglog(curve.sizes, cost, "o-", label=f"{curve.task}: {curve.exponent:.2f}")
+        sizes = np.array(shown[0].sizes)
+        lowest = min(min(curve.cpu_ms + curve.wall_ms) for curve in shown)
+        slope = -1 if kind == "threads" else 1
+        panel.loglog(sizes, 0.7 * lowest * (sizes / sizes[0]) ** slope, "k:", label=f"slope {slope}")
+        panel.set_xlabel(kind)
+        panel.set_xticks(sizes, [f"{size:.3g}" for size in sizes])
+        panel.minorticks_off()
+        panel.set_ylabel("wall ms" if kind == "threads" else "CPU ms")
+        panel.legend(fontsize=7)
+    figure.tight_layout()
+    with atomic_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=90)
+    plt.close(figure)
