@@ -45,7 +45,7 @@ from edslam_ti.pictures import (
 )
 from edslam_ti.rendering import View
 from edslam_ti.slam import Slam
-from edslam_ti.surface_errors import mesh_errors
+from edslam_ti.surface_errors import TrueSurfaces, lookouts, mesh_errors, seen_pixels
 from edslam_ti.trajectory import Trajectory, write_tum
 from edslam_ti.visualization import plot_trajectory
 from edslam_ti.volume import without_depth_edges
@@ -206,7 +206,8 @@ def _metrics(state: Run, of_map: dict[str, Any]) -> dict[str, Any]:
             f"consecutive frames; images: every {config.evaluation.hold_out_every}th depth frame held out "
             "from mapping, rendered at its estimated pose, over pixels with true depth (_all: every "
             "pixel), corrected by EventNeRF's linear fit in log space, one for each set of views; mapped: "
-            "frames used for mapping; novel: true poses beside the path, moved into the estimate's frame"
+            "frames used for mapping; novel: true poses beside the path, moved into the estimate's frame, "
+            "over pixels whose surface the path saw (_all: every pixel)"
         ),
         "protocols": _protocols(state, errors | of_map),
     }
@@ -222,7 +223,7 @@ class _RenderedView:
     kind: str  # held out, mapped or novel
     timestamp: float  # seconds
     image: np.ndarray | None  # [H, W] truth
-    depth: np.ndarray | None  # [H, W] metres, truth
+    depth: np.ndarray | None  # [H, W] metres, truth; of novel views 0 where the path never saw the surface
     view: View
 
 
@@ -294,10 +295,15 @@ def _novel_views(state: Run, mapper: Mapper, most: int) -> Iterator[_RenderedVie
         return
     start, end = trajectory.timestamps[[0, -1]]
     novel = [v for v in state.sequence.novel_views() if start <= v.timestamp <= end]
+    camera, surfaces = state.sequence.camera, state.sequence.surfaces_file
+    looks = TrueSurfaces(surfaces).looks(camera, lookouts(truth)) if surfaces else None
     T_estimate_truth = np.linalg.inv(align_views(trajectory.resampled(truth.timestamps).poses, truth.poses))
     for true in (novel[k] for k in _evenly(len(novel), most)):
-        view = mapper.render(state.sequence.camera, orthonormalized(T_estimate_truth @ true.T_world_camera))
-        yield _RenderedView("novel", true.timestamp, true.image, true.depth, view)
+        view = mapper.render(camera, orthonormalized(T_estimate_truth @ true.T_world_camera))
+        depth = true.depth
+        if looks is not None:
+            depth = np.where(seen_pixels(camera, depth, true.T_world_camera, looks), depth, 0)
+        yield _RenderedView("novel", true.timestamp, true.image, depth, view)
 
 
 def _measured(views: list[_RenderedView], lpips_weights: Path | None) -> ImageMetrics | None:

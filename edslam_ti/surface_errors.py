@@ -17,6 +17,7 @@ from edslam_ti.trajectory import Trajectory
 NUM_SAMPLES = 100_000  # points drawn on a reconstructed mesh
 SPACING = 0.02  # metres; one true point is kept of those that fall into a cube of this size
 COMPLETE_WITHIN = 0.05  # metres
+OCCLUSION = 0.03  # metres, or this share of the depth, by which a surface may lie behind what is in front
 VIEW_STEP, VIEW_TURN = 0.1, 5.0  # metres, degrees between the views that say what was seen
 
 
@@ -29,31 +30,34 @@ class SurfaceErrors:
     completion_ratio: float  # share of those points with the mesh within 5 cm
 
 
+@dataclass(frozen=True)
+class Look:
+    """Depth seen by one camera."""
+
+    camera: Camera
+    T_world_camera: np.ndarray  # [4, 4]
+    depth: np.ndarray  # [H, W] metres, 0 = nothing
+
+
 class TrueSurfaces:
     """The triangles of a scene."""
 
     def __init__(self, path: Path) -> None:
         self._scene = _ray_casting(read_triangles(path))
 
-    def seen_points(
-        self,
-        camera: Camera,
-        poses: Iterable[np.ndarray],  # [4, 4] T_world_camera
-    ) -> np.ndarray:  # [N, 3] float32 metres, world
-        """Return points evenly spread over what cameras at these poses see, every other pixel looked at."""
+    def depth(self, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:  # [H, W] metres, 0 = nothing
+        """Return the depth seen from a pose."""
         o3d = load_open3d()
-        rays = camera.downscaled(2).rays()  # [H / 2, W / 2, 3], z = 1
-        kept = [np.empty((0, 3), np.float32)]
-        for T in poses:
-            directions = rays @ T[:3, :3].T
-            origins = np.broadcast_to(T[:3, 3], directions.shape)
-            cast = np.concatenate([origins, directions], -1).astype(np.float32)
-            depth = self._scene.cast_rays(o3d.core.Tensor(cast))["t_hit"].numpy()
-            hit = np.isfinite(depth)
-            kept.append((origins[hit] + depth[hit][:, None] * directions[hit]).astype(np.float32))
-        points = np.concatenate(kept)
-        _, first = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_index=True)
-        return points[np.sort(first)]
+        directions = camera.rays() @ T_world_camera[:3, :3].T  # [H, W, 3] with z = 1: t is the depth
+        origins = np.broadcast_to(T_world_camera[:3, 3], directions.shape)
+        rays = np.concatenate([origins, directions], -1).astype(np.float32)
+        distance = self._scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+        return np.where(np.isfinite(distance), distance, 0).astype(np.float32)
+
+    def looks(self, camera: Camera, poses: Iterable[np.ndarray]) -> "list[Look]":
+        """Return what cameras at these poses [4, 4] see, at half the size."""
+        small = camera.downscaled(2)
+        return [Look(small, T, self.depth(small, T)) for T in poses]
 
     def errors(
         self,
@@ -97,8 +101,52 @@ def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -
     truth = sequence.truth.resampled(np.array(inside))
     beside = [v.T_world_camera for v in sequence.novel_views() if inside[0] <= v.timestamp <= inside[-1]]
     surfaces = TrueSurfaces(sequence.surfaces_file)
-    seen = surfaces.seen_points(sequence.camera, [*truth.spread(VIEW_STEP, VIEW_TURN), *beside])
+    seen = seen_points(surfaces.looks(sequence.camera, [*lookouts(truth), *beside]))
     return surfaces.errors(mesh, seen, align_views(estimate.resampled(truth.timestamps).poses, truth.poses))
+
+
+def seen_points(looks: Iterable[Look]) -> np.ndarray:  # [N, 3] float32 metres, world
+    """Return points evenly spread over all that was seen."""
+    kept = [np.empty((0, 3), np.float32)]
+    kept += [_back_projected(a.depth, a.camera, a.T_world_camera).astype(np.float32) for a in looks]
+    points = np.concatenate(kept)
+    _, first = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def seen_pixels(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] metres of a view, 0 = missing
+    T_world_camera: np.ndarray,  # [4, 4] of that view
+    looks: Iterable[Look],
+) -> np.ndarray:  # [H, W] bool
+    """Return the pixels of a view whose surface is visible in one of the looks, too."""
+    points = _back_projected(depth, camera, T_world_camera)
+    seen = np.zeros(len(points), bool)
+
+    def distance(look: Look) -> float:
+        return float(np.linalg.norm(look.T_world_camera - T_world_camera))
+
+    for look in sorted(looks, key=distance):  # the nearest see most: little is left for the others
+        left = np.flatnonzero(~seen)
+        if len(left) == 0:
+            break
+        T_camera_world, seer = np.linalg.inv(look.T_world_camera), look.camera
+        p = points[left] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+        z = np.maximum(p[:, 2], 1e-6)
+        u = np.rint(seer.fx * p[:, 0] / z + seer.cx)
+        v = np.rint(seer.fy * p[:, 1] / z + seer.cy)
+        inside = (p[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < seer.width) & (v < seer.height)
+        front = look.depth[v[inside].astype(int), u[inside].astype(int)]
+        seen[left[inside]] = z[inside] < front + np.maximum(OCCLUSION, OCCLUSION * front)
+    result = np.zeros(depth.shape, bool)
+    result[depth > 0] = seen
+    return result
+
+
+def lookouts(path: Trajectory) -> list[np.ndarray]:  # [4, 4] each
+    """Return poses of a path from which all is seen that the path sees."""
+    return path.spread(VIEW_STEP, VIEW_TURN)
 
 
 def read_triangles(path: Path) -> Any:
@@ -109,6 +157,11 @@ def read_triangles(path: Path) -> Any:
     if len(mesh.triangles) == 0:
         raise DataError(f"{path}: expected a mesh, could not read any triangle")
     return mesh
+
+
+def _back_projected(depth: np.ndarray, camera: Camera, T: np.ndarray) -> np.ndarray:  # [N, 3] metres, world
+    known = depth > 0
+    return depth[known][:, None] * camera.rays()[known] @ T[:3, :3].T + T[:3, 3]
 
 
 def _ray_casting(mesh: Any) -> Any:

@@ -8,7 +8,7 @@ import pytest
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
 from edslam_ti.open3d_loader import load_open3d
-from edslam_ti.surface_errors import SPACING, TrueSurfaces, read_triangles
+from edslam_ti.surface_errors import SPACING, TrueSurfaces, read_triangles, seen_pixels, seen_points
 
 CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
 
@@ -32,19 +32,39 @@ def surfaces(tmp_path_factory) -> TrueSurfaces:
 
 
 def test_seen_points_lie_on_the_surface_inside_the_view(surfaces: TrueSurfaces) -> None:
-    seen = surfaces.seen_points(CAMERA, [np.eye(4)])
+    seen = seen_points(surfaces.looks(CAMERA, [np.eye(4)]))
     assert seen[:, 2] == pytest.approx(2.0)
     assert np.abs(seen[:, 0]).max() == pytest.approx(2.0 * 31 / 40, abs=0.06)
     moved = np.eye(4)
     moved[0, 3] = 0.5
-    both = surfaces.seen_points(CAMERA, [np.eye(4), moved, moved])
+    both = seen_points(surfaces.looks(CAMERA, [np.eye(4), moved, moved]))
     cells = np.floor(both / SPACING).astype(int)
     assert len(np.unique(cells, axis=0)) == len(both)  # what is seen twice counts once
     assert both[:, 0].max() == pytest.approx(seen[:, 0].max() + 0.5, abs=1e-5)
 
 
+def test_pixels_are_seen_where_another_camera_looked_and_nothing_was_in_the_way(tmp_path: Path) -> None:
+    o3d = load_open3d()
+    scene = wall(2.0) + wall(1.0, half_width=0.2)  # a small board in front of the wall, 10 m high
+    o3d.io.write_triangle_mesh(str(tmp_path / "a.ply"), scene)
+    surfaces = TrueSurfaces(tmp_path / "a.ply")
+    beside = np.eye(4)
+    beside[0, 3] = 0.5
+    depth = surfaces.depth(CAMERA, beside)
+    assert set(np.round(np.unique(depth), 4)) == {1.0, 2.0}
+    seen = seen_pixels(CAMERA, depth, beside, surfaces.looks(CAMERA, [np.eye(4)]))
+    x = 0.5 + depth * CAMERA.rays()[..., 0]  # metres, of what each pixel shows
+    on_wall = depth > 1.5
+    border = 2.0 * CAMERA.cx / CAMERA.fx  # 1.575 m: what the camera at 0 sees of the wall,
+    hidden = np.abs(x) < 0.34  # and, of 0.4 m, what the board surely hides
+    assert seen[on_wall & (x < border - 0.06) & ~(np.abs(x) < 0.46)].all()
+    assert not seen[on_wall & (x > border + 0.06)].any()
+    assert not seen[on_wall & hidden].any()
+    assert seen[depth < 1.5].all()
+
+
 def test_mesh_in_front_of_the_surface_is_as_far_in_both_directions(surfaces: TrueSurfaces) -> None:
-    seen = surfaces.seen_points(CAMERA, [np.eye(4)])
+    seen = seen_points(surfaces.looks(CAMERA, [np.eye(4)]))
     errors = surfaces.errors(wall(1.97), seen, np.eye(4))
     assert errors.accuracy_cm == pytest.approx(3.0, abs=1e-3)
     assert errors.completion_cm == pytest.approx(3.0, abs=1e-3)
@@ -56,7 +76,7 @@ def test_mesh_in_front_of_the_surface_is_as_far_in_both_directions(surfaces: Tru
 
 
 def test_half_a_mesh_is_accurate_and_half_complete(surfaces: TrueSurfaces) -> None:
-    seen = surfaces.seen_points(CAMERA, [np.eye(4)])
+    seen = seen_points(surfaces.looks(CAMERA, [np.eye(4)]))
     errors = surfaces.errors(wall(2.0, right=0.0), seen, np.eye(4))
     assert errors.accuracy_cm < 1e-3
     # The right half is 0 to 1.55 m away, 5 cm of it near enough.
