@@ -356,13 +356,15 @@ class Workspace:
     items: Tensor  # [workers, blocks of a tile, longest] int32
 
     @staticmethod
-    def of(projection: Projection, lists: TileLists) -> "Workspace":
+    def of(projection: Projection, lists: TileLists, num_views: int = 1) -> "Workspace":
+        """Return memory for as many tiles as are worked on at once, `num_views` a worker."""
         record, longest, blocks = projection.record, max(lists.longest, 1), (lists.tile // BLOCK) ** 2
+        spaces = workers() * num_views
         return Workspace(
-            record.new_empty(workers() * longest, record.shape[1]),
-            record.new_empty(workers() * longest, gradient_size(projection.channels)),
-            torch.empty(workers(), blocks, dtype=torch.int32, device=record.device),
-            torch.empty(workers(), blocks, longest, dtype=torch.int32, device=record.device),
+            record.new_empty(spaces * longest, record.shape[1]),
+            record.new_empty(spaces * longest, gradient_size(projection.channels)),
+            torch.empty(spaces, blocks, dtype=torch.int32, device=record.device),
+            torch.empty(spaces, blocks, longest, dtype=torch.int32, device=record.device),
         )
 
 

@@ -1,0 +1,317 @@
+"""A map compared with what events and depth say, and all gradients of that in one pass.
+
+Each block of pixels is composited, compared and differentiated while its list is still in the cache: no
+images are written, alpha is computed once, and the backward pass neither divides nor takes an exp. One
+projection, one sort and one launch serve all views.
+
+    two views, Eq. 10-12:  L = s sum (log((I_end + eps) / (I_start + eps)) - measured)^2
+    one view:              L = s_e sum (log(I + eps) - target)^2 + s_d sum_{measured > 0} |D - measured|
+
+with I = sum_i c_i alpha_i T_i + T_end background, D = sum_i d_i alpha_i T_i (Eq. 8).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+import torch
+from torch import Tensor
+
+from kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions
+from kernels.projection import (
+    BLOCK,
+    FEATURES,
+    LOW_PASS,
+    MEAN_X,
+    MEAN_Y,
+    MIN_ALPHA,
+    by_sums,
+    project,
+    project_backward,
+)
+from kernels.rasterization import (
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    TILE,
+    Workspace,
+    check_gaussians,
+    check_tile,
+    clear,
+    fill_slots,
+    from_blocks,
+    lane_columns,
+    lane_rows,
+    list_blocks,
+    log_255_alpha,
+    to_blocks,
+)
+from kernels.runtime import CHUNK, check_shape, plain
+from kernels.tile_lists import list_pairs
+
+ALPHA, WEIGHT = 0, 1  # what is kept of every record that a block draws
+
+
+@ti.func
+def composite(
+    record: ti.template(), items: ti.template(), space, block, number, x, y, is_inside, kept: ti.template()
+):
+    """T_end, intensity and depth of a block; keeps alpha and weight of what it draws."""
+    T = ti.select(is_inside, 1.0, 0.0)
+    intensity, depth = T * 0.0, T * 0.0
+    for n in range(number):
+        at = space * items.shape[2] + items[space, block, n]
+        inside = log_255_alpha(record, at, x - record[at, MEAN_X], y - record[at, MEAN_Y])
+        raw = MIN_ALPHA * exp(inside)
+        is_drawn = (inside >= 0.0) & (T > MIN_TRANSMITTANCE)
+        alpha = ti.select(is_drawn, ti.select(raw < MAX_ALPHA, raw, MAX_ALPHA), 0.0)
+        weight = alpha * T
+        depth += weight * record[at, FEATURES]
+        intensity += weight * record[at, FEATURES + 1]
+        T = T - weight
+        kept[space, n, ALPHA], kept[space, n, WEIGHT] = alpha, weight
+    return T, intensity, depth
+
+
+@ti.func
+def differentiate_block(
+    record: ti.template(), items: ti.template(), space, block, number, x, y, kept: ti.template(),
+    grad_intensity, grad_depth, background,
+    near_grad: ti.template(), has_depth: ti.template(),
+):  # fmt: skip
+    """Add to the gradients of the records; see `kernels.rasterization.draw_backward`."""
+    behind = background * grad_intensity
+    for from_end in range(number):
+        n = number - 1 - from_end
+        at = space * items.shape[2] + items[space, block, n]
+        alpha, weight = kept[space, n, ALPHA], kept[space, n, WEIGHT]
+        q = record[at, FEATURES + 1] * grad_intensity - behind
+        if ti.static(has_depth):
+            q += record[at, FEATURES] * grad_depth
+        behind += alpha * q
+        v = ti.select(alpha < MAX_ALPHA, weight * q, 0.0)  # min() passes no gradient where it cuts
+        dx, dy = x - record[at, MEAN_X], y - record[at, MEAN_Y]
+        v_x, v_y = v * dx, v * dy
+        total = sums_of(
+            v, v_x, v_y, v_x * dx, v_x * dy, v_y * dy, weight * grad_depth, weight * grad_intensity
+        )
+        near_grad[at, 0] = near_grad[at, 0] + total
+
+
+@vector_instructions
+@ti.kernel
+def _compare_views(
+    # inputs
+    records: sums(2),  # [V * padded, record_size / SUMS]
+    tile_start: ti.types.ndarray(ti.i32, ndim=1),  # [V * tiles + 1]
+    pairs: ti.types.ndarray(ti.i32, ndim=2),  # [P, 2] Gaussian and slot
+    width: ti.i32,
+    height: ti.i32,
+    tile: ti.i32,
+    background: float,
+    epsilon: float,
+    target: lanes(1),  # [blocks] log brightness, or its change between two views
+    target_depth: lanes(1),  # [blocks] metres, 0 = missing; not read where there are two views
+    scale: float,  # s, s_e
+    depth_scale: float,  # s_d
+    next_tile: ti.types.ndarray(ti.i32, ndim=1),  # [1] queue of tiles, starts at 0
+    # scratch by worker and view; the first two are the same memory
+    near: sums(2),  # [workers * V * longest, record_size / SUMS]
+    near_record: ti.types.ndarray(ndim=2),  # [workers * V * longest, record_size]
+    near_grad: sums(2),  # [workers * V * longest, 1]
+    number: ti.types.ndarray(ti.i32, ndim=2),  # [workers * V, blocks of a tile]
+    items: ti.types.ndarray(ti.i32, ndim=3),  # [workers * V, blocks of a tile, longest]
+    kept: lanes(3),  # [workers * V, longest, 2]
+    # outputs
+    difference: lanes(1),  # [blocks] rendered minus target
+    tile_losses: ti.types.ndarray(ndim=2),  # [tiles, 2] sums of squares, and of depth errors
+    slot_grad: sums(2),  # [P, 1]
+    V: ti.template(),
+):
+    columns, across, tiles = (width + tile - 1) // tile, tile // BLOCK, tile_losses.shape[0]
+    longest = items.shape[2]
+    for chunk in range(number.shape[0] // V * CHUNK):
+        if chunk % CHUNK == 0:
+            w = chunk // CHUNK
+            t = ti.atomic_add(next_tile[0], 1)
+            while t < tiles:
+                column, row = t % columns * across, t // columns * across
+                for v in range(V):
+                    first, past = tile_start[v * tiles + t], tile_start[v * tiles + t + 1]
+                    list_blocks(
+                        records, pairs, first, past, column, row, across, w * V + v,
+                        near, near_record, number, items, 1,
+                    )  # fmt: skip
+                    clear(near_grad, (w * V + v) * longest, past - first, 1)
+                squares, errors = 0.0, 0.0
+                for block in range(across * across):
+                    x = (column + block % across) * BLOCK + lane_columns()
+                    y = (row + block // across) * BLOCK + lane_rows()
+                    is_inside = (x < width) & (y < height)
+                    i, space = t * across * across + block, w * V
+                    T, intensity, depth = composite(
+                        near_record, items, space, block, number[space, block], x, y, is_inside, kept
+                    )
+                    value = intensity + T * background + epsilon
+                    if ti.static(V == 2):
+                        T_end, intensity_end, _ = composite(
+                            near_record,
+                            items,
+                            space + 1,
+                            block,
+                            number[space + 1, block],
+                            x,
+                            y,
+                            is_inside,
+                            kept,
+                        )
+                        value_end = intensity_end + T_end * background + epsilon
+                        r = ti.select(is_inside, log(value_end / value) - target[i], 0.0)
+                        difference[i] = r
+                        squares += (r * r).sum()
+                        slope = 2.0 * scale * r
+                        zero = r * 0.0
+                        differentiate_block(
+                            near_record, items, space, block, number[space, block], x, y, kept,
+                            (0.0 - slope) / value, zero, background, near_grad, False,
+                        )  # fmt: skip
+                        differentiate_block(
+                            near_record, items, space + 1, block, number[space + 1, block], x, y, kept,
+                            slope / value_end, zero, background, near_grad, False,
+                        )  # fmt: skip
+                    else:
+                        r = ti.select(is_inside, log(value) - target[i], 0.0)
+                        difference[i] = r
+                        squares += (r * r).sum()
+                        error = depth - target_depth[i]
+                        sign = ti.select(error > 0.0, 1.0, -1.0)
+                        sign = ti.select(is_inside & (target_depth[i] > 0.0), sign, 0.0)
+                        errors += (error * sign).sum()
+                        differentiate_block(
+                            near_record, items, space, block, number[space, block], x, y, kept,
+                            2.0 * scale * r / value, depth_scale * sign, background, near_grad, True,
+                        )  # fmt: skip
+                tile_losses[t, 0], tile_losses[t, 1] = squares, errors
+                for v in range(V):
+                    first, past = tile_start[v * tiles + t], tile_start[v * tiles + t + 1]
+                    fill_slots(near_grad, (w * V + v) * longest, pairs, first, past, slot_grad, 1)
+                t = ti.atomic_add(next_tile[0], 1)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What views of a map differ by, from what was measured; only `loss` is differentiable."""
+
+    loss: Tensor  # scalar
+    event: Tensor  # scalar, the part of the loss that is about brightness
+    difference: Tensor  # [H, W] log brightness, or its change, minus the target
+
+
+class _CompareViews(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx, means, quats, scales, opacities, colors, poses, intrinsics, size, target, target_depth,
+        weights, background, epsilon, low_pass, tile,
+    ):  # fmt: skip
+        num_views = len(poses)
+        projection = project(
+            means, quats, scales, opacities, colors, plain("poses", poses), intrinsics, size, tile, low_pass
+        )
+        lists = list_pairs(projection, size, tile)
+        space = Workspace.of(projection, lists, num_views)
+        tiles = (len(lists.start) - 1) // num_views
+        record = projection.record
+        targets = to_blocks(torch.stack([plain("target", target), plain("depth", target_depth)]), tile)
+        difference = torch.empty_like(targets[0])
+        losses = record.new_empty(tiles, 2)
+        slot_grad = lists.new_slots(projection)
+        _compare_views(
+            by_sums(record), lists.start, lists.pairs, *size, tile, background, epsilon,
+            targets[0], targets[1], *weights, torch.zeros(1, dtype=torch.int32),
+            by_sums(space.near), space.near, by_sums(space.near_grad), space.number, space.items,
+            record.new_empty(space.items.shape[0], space.items.shape[2], 2, LANES),
+            difference, losses, by_sums(slot_grad), num_views,
+        )  # fmt: skip
+        ctx.gradients, ctx.grad_poses = project_backward(projection, slot_grad)
+        squares, errors = losses.sum(0, dtype=torch.float64).tolist()
+        event, depth = weights[0] * squares, weights[1] * errors
+        outputs = (
+            means.new_tensor(event + depth),
+            means.new_tensor(event),
+            from_blocks(difference[None], size, tile)[0],
+        )
+        ctx.mark_non_differentiable(*outputs[1:])
+        return outputs
+
+    @staticmethod
+    def backward(ctx, grad_loss, _event, _difference):
+        factor = float(grad_loss)
+        if factor != 1:
+            ctx.gradients = [gradient * factor for gradient in ctx.gradients]
+        return *ctx.gradients, ctx.grad_poses * factor, *[None] * 9
+
+
+def compare_change(
+    means: Tensor,  # [N, 3] metres, world frame
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] metres
+    opacities: Tensor,  # [N] in (0, 1)
+    colors: Tensor,  # [N, 1] brightness
+    T_camera_world: Tensor,  # [2, 4, 4] at the start and at the end
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],  # (width, height)
+    measured: Tensor,  # [H, W] change of log brightness, Eq. 11
+    background: float,  # brightness behind everything
+    epsilon: float,
+    scale: float,  # of the sum of squares
+    low_pass: float = LOW_PASS,
+    tile: int = TILE,
+) -> Comparison:
+    """Return `scale` times the squared error of the brightness change between two views, Eq. 10-12."""
+    check_shape("T_camera_world", T_camera_world, (2, 4, 4))
+    return _compare(
+        means, quats, scales, opacities, colors, T_camera_world, intrinsics, size,
+        measured, torch.zeros_like(measured), (scale, 0.0), background, epsilon, low_pass, tile,
+    )  # fmt: skip
+
+
+def compare_view(
+    means: Tensor,  # [N, 3] metres, world frame
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] metres
+    opacities: Tensor,  # [N] in (0, 1)
+    colors: Tensor,  # [N, 1] brightness
+    T_camera_world: Tensor,  # [4, 4]
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],  # (width, height)
+    log_brightness: Tensor,  # [H, W] target
+    depth: Tensor,  # [H, W] target, metres, 0 = missing
+    background: float,  # brightness behind everything
+    epsilon: float,
+    scale: float,  # of the sum of squares
+    depth_scale: float,  # of the sum of absolute depth errors
+    low_pass: float = LOW_PASS,
+    tile: int = TILE,
+) -> Comparison:
+    """Return how much a view differs from a target, in brightness squared and in depth."""
+    check_shape("T_camera_world", T_camera_world, (4, 4))
+    return _compare(
+        means, quats, scales, opacities, colors, T_camera_world[None], intrinsics, size,
+        log_brightness, depth, (scale, depth_scale), background, epsilon, low_pass, tile,
+    )  # fmt: skip
+
+
+def _compare(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, poses: Tensor,
+    intrinsics: tuple[float, float, float, float], size: tuple[int, int],
+    target: Tensor, target_depth: Tensor, weights: tuple[float, float],
+    background: float, epsilon: float, low_pass: float, tile: int,
+) -> Comparison:  # fmt: skip
+    check_gaussians(means, quats, scales, opacities, colors)
+    check_shape("colors", colors, (len(means), 1))
+    check_shape("target", target, (size[1], size[0]))
+    check_shape("depth", target_depth, (size[1], size[0]))
+    check_tile(tile, size)
+    outputs = _CompareViews.apply(
+        means, quats, scales, opacities, colors, poses, tuple(intrinsics), tuple(size),
+        target, target_depth, weights, background, epsilon, low_pass, tile,
+    )  # fmt: skip
+    return Comparison(*outputs)
