@@ -5,48 +5,68 @@ from typing import Any
 
 import numpy as np
 
-from edslam_ti.config import TrackingConfig
+from edslam_ti.baselines import METHODS
+from edslam_ti.config import Config
 from edslam_ti.reproduce.cases import Case, Recording
 from edslam_ti.reproduce.runs import Variant
 
-DEFAULT = Variant("ed_slam", "ed_slam", {"mapping": {"enabled": False}})
 NO_SURFACE = 1e4  # a standard deviation so large that time surfaces count for nothing
+SURFACES = {"brightness": False}  # time surfaces and depth, without brightness images
 
-# What is changed -> label of a row -> tracking settings; {} is the default.
-SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
-    "Patch size (Table I of the paper)": {f"{p} x {p}": {"patch_size": p} for p in (5, 7, 9, 11, 13)},
-    "Number of patches (Table II of the paper)": {
-        f"{n}": {"num_patches": n} for n in (100, 200, 400, 600, 800)
-    },
-    "Directions of Eq. 5": {
-        "both": {"directions": "both"},
-        "reference to new frame alone": {"directions": "forward"},
-    },
-    "Residuals": {
-        "time surface and depth": {},
-        "time surface alone": {"depth_weight": 0.0},
-        "depth alone": {"surface_sigma": NO_SURFACE},
-    },
-    "References": {
-        "previous frame (paper)": {"references": "previous"},
-        "keyframe": {"references": "keyframe"},
-        "both": {"references": "both"},
-    },
+Changes = dict[str, Any]  # tracking settings that differ from a method's own
+
+# What is changed -> the method, and label of a row -> changes.
+TABLES: dict[str, tuple[str, dict[str, Changes]]] = {
+    "Residuals": (
+        "ed_slam",
+        {
+            "brightness images and depth": {},
+            "brightness images alone": {"depth_weight": 0.0},
+            "time surfaces and depth": SURFACES,
+            "time surfaces alone": SURFACES | {"depth_weight": 0.0},
+            "depth alone": SURFACES | {"surface_sigma": NO_SURFACE},
+        },
+    ),
+    "Patch size (Table I), `ed_slam_paper`": (
+        "ed_slam_paper",
+        {f"{p} x {p}": {"patch_size": p} for p in (5, 7, 9, 11, 13)},
+    ),
+    "Patch size, `ed_slam`": ("ed_slam", {f"{p} x {p}": {"patch_size": p} for p in (5, 7, 9, 11, 13)}),
+    "Number of patches (Table II), `ed_slam_paper`": (
+        "ed_slam_paper",
+        {f"{n}": {"num_patches": n} for n in (200, 400, 600, 800)},
+    ),
+    "Number of patches, `ed_slam`": ("ed_slam", {f"{n}": {"num_patches": n} for n in (200, 400, 600, 800)}),
+    "Directions of Eq. 5, `ed_slam_paper`": (
+        "ed_slam_paper",
+        {"both": {}, "reference to new frame alone": {"directions": "forward"}},
+    ),
+    "Directions, time surfaces and depth": (
+        "ed_slam",
+        {"both": SURFACES, "reference to new frame alone": SURFACES | {"directions": "forward"}},
+    ),
+    "References, time surfaces and depth": (
+        "ed_slam",
+        {
+            "previous frame": SURFACES | {"references": "previous"},
+            "keyframe": SURFACES,
+            "keyframe and previous frame": SURFACES | {"references": "both"},
+        },
+    ),
 }
 
 
 def ablation_rows() -> dict[str, dict[str, Variant]]:
-    """Return the variant of every table and row; rows at the defaults share one."""
+    """Return the variant of every table and row; rows with the same settings share one."""
     return {
-        title: {label: _variant(changed) for label, changed in rows.items()}
-        for title, rows in SETTINGS.items()
+        title: {label: _variant(method, changes) for label, changes in rows.items()}
+        for title, (method, rows) in TABLES.items()
     }
 
 
 def ablation_variants() -> list[Variant]:
-    """Return every variant once, the default first."""
-    variants = {v.name: v for rows in ablation_rows().values() for v in rows.values()}
-    return [DEFAULT, *(v for name, v in variants.items() if name != DEFAULT.name)]
+    """Return every variant once."""
+    return list({v.name: v for rows in ablation_rows().values() for v in rows.values()}.values())
 
 
 def ablation_cases(scenes: Sequence[str], seeds: Sequence[int]) -> list[Case]:
@@ -57,7 +77,7 @@ def ablation_cases(scenes: Sequence[str], seeds: Sequence[int]) -> list[Case]:
 def ablation_markdown(results: Sequence[dict[str, Any]]) -> str:
     """Return one table per setting: ATE rmse in cm on each case (mean over seeds), lost frames, speed."""
     rows = list(dict.fromkeys(r["row"] for r in results))
-    lines = ["ATE rmse in cm, tracking alone; `default` marks the setting that `ed_slam` has.", ""]
+    lines = ["ATE rmse in cm, tracking alone; `default`: the method's own settings.", ""]
     for title, variants in ablation_rows().items():
         header = [title, *rows, "mean", "lost frames", "Hz"]
         lines += [f"| {' | '.join(header)} |", "| " + " | ".join(["---"] * len(header)) + " |"]
@@ -74,17 +94,15 @@ def ablation_markdown(results: Sequence[dict[str, Any]]) -> str:
                 ]
             else:
                 cells += ["-"] * 3
-            name = f"{label} (default)" if variant.name == DEFAULT.name else label
+            name = f"{label} (default)" if variant.name == variant.method else label
             lines.append(f"| {' | '.join([name, *cells])} |")
         lines.append("")
     problems = list(dict.fromkeys(f"- {r['variant']}: {r['error']}" for r in results if "error" in r))
     return "\n".join(lines + problems)
 
 
-def _variant(changed: dict[str, Any]) -> Variant:
-    defaults = TrackingConfig()
-    differences = {name: value for name, value in changed.items() if getattr(defaults, name) != value}
-    if not differences:
-        return DEFAULT
-    name = "-".join(f"{key}_{value}" for key, value in differences.items())
-    return Variant(name, DEFAULT.method, DEFAULT.differences | {"tracking": differences})
+def _variant(method: str, changes: Changes) -> Variant:
+    own = Config(method=method).updated(dict(METHODS[method].overrides)).tracking
+    differences = {name: value for name, value in changes.items() if getattr(own, name) != value}
+    name = "-".join([method, *(f"{key}_{value}" for key, value in differences.items())])
+    return Variant(name, method, {"mapping": {"enabled": False}, "tracking": differences})

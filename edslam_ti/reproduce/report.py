@@ -109,7 +109,7 @@ def _measures(results: Sequence[Result]) -> list[str]:
         "ate_rmse_cm": "ATE cm",
         "ate_max_cm": "max cm",
         "ate_at_depth_rmse_cm": "ATE at depth frames cm",
-        "ate_frontend_rmse_cm": "ATE before mapping cm",
+        "ate_frontend_rmse_cm": "ATE as first tracked cm",
         "rpe_trans_cm": "RPE cm",
         "rpe_rot_deg": "RPE deg",
         "final_drift_cm": "drift at the end cm",
