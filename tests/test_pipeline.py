@@ -18,7 +18,7 @@ import yaml
 from rich.console import Console
 from sequences import settings
 
-from edslam_ti import pipeline, results
+from edslam_ti import evaluation, pipeline, results
 from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
@@ -215,6 +215,17 @@ def test_both_protocols_are_named(result: Path) -> None:
     assert theirs["psnr_corrected_db"] == metrics["psnr_corrected_db_all"]
     assert theirs["ssim"] == metrics["ssim_all"] != metrics["ssim_corrected_all"]
     assert "no slice of theirs" in theirs["trajectory"]
+
+
+def test_slice_of_inceventgs_is_measured_apart(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(evaluation.INCEVENTGS_SLICES, "tiny", (1, 5))  # of every second pose: 0.1 to 0.5 s
+    metrics = metrics_of(quiet_run(config_for(tiny_folder, tmp_path)))
+    theirs = metrics["protocols"]["inceventgs"]
+    assert theirs["trajectory"].startswith("their slice, 0.1 to 0.5 s")
+    assert 0 < theirs["ate_rmse_sim3_cm"] != metrics["ate_rmse_sim3_cm"]
+    assert 10 < theirs["psnr_corrected_db"] != metrics["psnr_corrected_db_all"]
 
 
 def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
