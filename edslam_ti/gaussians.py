@@ -49,7 +49,7 @@ class GaussianMap:
         self._cell_sizes = torch.tensor(config.brightness_cells)
         self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
         self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
-        self._cell_adam = torch.optim.Adam([self._cell_table], lr=config.cells_rate, eps=1e-15)
+        self._cell_adam = torch.optim.Adam([self._cell_table], lr=config.cells_rate, eps=1e-15, fused=True)
         self._cell_rate = config.cells_rate
         self._replace(empty, moments=None)
 
@@ -156,6 +156,7 @@ class GaussianMap:
                 for name, value in self._raw.items()
             ],
             eps=1e-15,
+            fused=True,  # one pass over the memory instead of eight
         )
         if moments is None:
             self._steps = 0

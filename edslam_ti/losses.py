@@ -3,6 +3,13 @@
 import torch
 from torch import Tensor
 
+from edslam_ti.camera import Camera
+from edslam_ti.gaussians import Gaussians
+from edslam_ti.geometry import inverse
+from kernels.view_losses import Comparison, compare_change, compare_view
+
+CHANGE_FLOOR = 1e-3  # squared log brightness; an interval without events must not divide by zero
+
 
 def brightness_change(
     intensity_start: Tensor,  # [H, W]
@@ -21,8 +28,46 @@ def event_loss(
 
     The raw loss grows with motion and interval length; divided, every interval weighs alike.
     """
-    floor = 1e-3  # an interval without events must not divide by zero
-    return (predicted - measured).square().mean() / (measured.square().mean() + floor)
+    return (predicted - measured).square().mean() / (measured.square().mean() + CHANGE_FLOOR)
+
+
+def change_loss(
+    gaussians: Gaussians,
+    camera: Camera,
+    T_world_camera: Tensor,  # [2, 4, 4] poses at the start and at the end
+    measured: Tensor,  # [H, W] Eq. 11
+    background: float,  # brightness behind everything
+    epsilon: float,
+) -> Comparison:
+    """Return `event_loss` of the brightness change between two views, with all gradients in one pass."""
+    scale = 1 / (measured.numel() * (float(measured.square().mean()) + CHANGE_FLOOR))
+    return compare_change(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors,
+        torch.stack([inverse(pose) for pose in T_world_camera]).float(),
+        camera.intrinsics, (camera.width, camera.height), measured, background, epsilon, scale,
+    )  # fmt: skip
+
+
+def view_loss(
+    gaussians: Gaussians,
+    camera: Camera,
+    T_world_camera: Tensor,  # [4, 4]
+    log_brightness: Tensor,  # [H, W] log(brightness + epsilon)
+    depth: Tensor | None,  # [H, W] metres, 0 = missing
+    background: float,  # brightness behind everything
+    epsilon: float,
+    weights: tuple[float, float],  # of the mean square of the first, and of `depth_loss`
+) -> Comparison:
+    """Return how much a view differs in brightness and depth, with all gradients in one pass."""
+    if depth is None or weights[1] == 0:
+        depth = torch.zeros_like(log_brightness)
+    num_measured = max(int((depth > 0).sum()), 1)
+    return compare_view(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors,
+        inverse(T_world_camera).float(), camera.intrinsics, (camera.width, camera.height),
+        log_brightness, depth, background, epsilon,
+        weights[0] / log_brightness.numel(), weights[1] / num_measured,
+    )  # fmt: skip
 
 
 def depth_loss(

@@ -14,7 +14,7 @@ from edslam_ti.frame import Frame
 from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
-from edslam_ti.losses import depth_loss, scale_loss
+from edslam_ti.losses import scale_loss, view_loss
 from edslam_ti.pointcloud import depth_to_points
 from edslam_ti.rendering import RenderOutput, View, render, render_view
 from edslam_ti.trajectory import Trajectory
@@ -261,16 +261,19 @@ class GaussianMapper:
         config = self._config
         poses = _Poses(trajectory, adjusts_poses)
         gaussians = self.gaussians.activated()
-        view = self._render(gaussians, poses.of_frame(index))
-        difference = torch.log(view.intensity + config.log_epsilon) - torch.from_numpy(
-            self.images.log_brightness(index)
-        )
-        self.images.take_over_details(index, difference.detach().numpy())
-        event = difference.square().mean() / EVENT_VARIANCE
-        loss = config.event_weight * event
         measured = self.images.depth(index)
-        if measured is not None and config.depth_weight > 0:
-            loss = loss + config.depth_weight * depth_loss(view.depth, torch.from_numpy(measured))
+        view = view_loss(
+            gaussians,
+            self._camera,
+            poses.of_frame(index),
+            torch.from_numpy(self.images.log_brightness(index)),
+            None if measured is None else torch.from_numpy(measured),
+            config.background,
+            config.log_epsilon,
+            (config.event_weight / EVENT_VARIANCE, config.depth_weight),
+        )
+        self.images.take_over_details(index, view.difference.numpy())
+        loss = view.loss
         if config.scale_weight > 0:
             log_scales = self.gaussians.raw["log_scales"]
             loss = loss + config.scale_weight * scale_loss(log_scales, config.max_scale_ratio)
@@ -279,7 +282,7 @@ class GaussianMapper:
         for frame, delta in poses.deltas.items():
             if delta.grad is not None:
                 self._refiner.step(frame, delta.grad.numpy(), trajectory)
-        value = float(event.detach())
+        value = float(view.difference.square().mean()) / EVENT_VARIANCE
         self.loss = value if np.isnan(self.loss) else 0.95 * self.loss + 0.05 * value
 
     def _render(self, gaussians: Gaussians, T_world_camera: Tensor) -> RenderOutput:

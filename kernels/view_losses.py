@@ -201,7 +201,6 @@ class Comparison:
     """What views of a map differ by, from what was measured; only `loss` is differentiable."""
 
     loss: Tensor  # scalar
-    event: Tensor  # scalar, the part of the loss that is about brightness
     difference: Tensor  # [H, W] log brightness, or its change, minus the target
 
 
@@ -232,17 +231,15 @@ class _CompareViews(torch.autograd.Function):
         )  # fmt: skip
         ctx.gradients, ctx.grad_poses = project_backward(projection, slot_grad)
         squares, errors = losses.sum(0, dtype=torch.float64).tolist()
-        event, depth = weights[0] * squares, weights[1] * errors
         outputs = (
-            means.new_tensor(event + depth),
-            means.new_tensor(event),
+            means.new_tensor(weights[0] * squares + weights[1] * errors),
             from_blocks(difference[None], size, tile)[0],
         )
-        ctx.mark_non_differentiable(*outputs[1:])
+        ctx.mark_non_differentiable(outputs[1])
         return outputs
 
     @staticmethod
-    def backward(ctx, grad_loss, _event, _difference):
+    def backward(ctx, grad_loss, _difference):
         factor = float(grad_loss)
         if factor != 1:
             ctx.gradients = [gradient * factor for gradient in ctx.gradients]

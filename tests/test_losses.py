@@ -5,7 +5,63 @@ import math
 import pytest
 import torch
 
-from edslam_ti.losses import brightness_change, depth_loss, event_loss, scale_loss
+from edslam_ti.camera import Camera
+from edslam_ti.config import MappingConfig
+from edslam_ti.gaussians import GaussianMap
+from edslam_ti.losses import brightness_change, change_loss, depth_loss, event_loss, scale_loss, view_loss
+from edslam_ti.rendering import render
+
+CAMERA = Camera(40, 30, 30.0, 30.0, 19.5, 14.5)
+BACKGROUND, EPSILON = 0.4, 1 / 255
+
+
+def scattered_map() -> GaussianMap:
+    """Return Gaussians at random places in front of the camera."""
+    generator = torch.Generator().manual_seed(2)
+    means = torch.rand(100, 3, generator=generator) * torch.tensor([2.0, 1.6, 1.0]) + torch.tensor(
+        [-1, -0.8, 1]
+    )
+    gaussians = GaussianMap(MappingConfig())
+    scales = 0.02 + 0.08 * torch.rand(100, 3, generator=generator)
+    gaussians.add(means, scales, 0.7, torch.rand(100, 1, generator=generator))
+    return gaussians
+
+
+def gradients(gaussians: GaussianMap, loss: torch.Tensor) -> list[torch.Tensor]:
+    return [loss.detach(), *torch.autograd.grad(loss, list(gaussians.raw.values()))]
+
+
+def assert_close(ours: list[torch.Tensor], theirs: list[torch.Tensor]) -> None:
+    for a, b in zip(ours, theirs, strict=True):
+        assert float((a - b).norm()) <= 1e-4 * float(b.norm()) + 1e-9  # float32, in another order
+
+
+def test_change_loss_is_the_event_loss_of_two_rendered_views() -> None:
+    gaussians = scattered_map()
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 0, 3] = 0.03
+    measured = 0.1 * torch.randn(30, 40, generator=torch.Generator().manual_seed(3))
+    ours = change_loss(gaussians.activated(), CAMERA, poses, measured, BACKGROUND, EPSILON).loss
+    start, end = (render(gaussians.activated(), CAMERA, pose, BACKGROUND).intensity for pose in poses)
+    theirs = event_loss(brightness_change(start, end, EPSILON), measured)
+    assert_close(gradients(gaussians, ours), gradients(gaussians, theirs))
+
+
+@pytest.mark.parametrize("has_depth", [True, False])
+def test_view_loss_is_the_losses_of_a_rendered_view(has_depth: bool) -> None:
+    gaussians, pose = scattered_map(), torch.eye(4, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(3)
+    target = torch.log(0.1 + 0.8 * torch.rand(30, 40, generator=generator))
+    depth = 1 + torch.rand(30, 40, generator=generator) if has_depth else None
+    shown = gaussians.activated()
+    ours = view_loss(shown, CAMERA, pose, target, depth, BACKGROUND, EPSILON, (2.0, 0.5))
+    view = render(gaussians.activated(), CAMERA, pose, BACKGROUND)
+    difference = torch.log(view.intensity + EPSILON) - target
+    theirs = 2 * difference.square().mean()
+    if depth is not None:
+        theirs = theirs + 0.5 * depth_loss(view.depth, depth)
+    torch.testing.assert_close(ours.difference, difference.detach(), atol=1e-5, rtol=1e-5)
+    assert_close(gradients(gaussians, ours.loss), gradients(gaussians, theirs))
 
 
 def test_brightness_change_is_the_difference_of_logarithms() -> None:
