@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import kernels
 from edslam_ti.baselines import METHODS
@@ -19,7 +20,8 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.datasets import SampledSequence, open_sequence
 from edslam_ti.datasets.base import Sample
-from edslam_ti.gaussians import GaussianMap
+from edslam_ti.gaussians import GaussianMap, Gaussians
+from edslam_ti.geometry import inverse
 from edslam_ti.losses import brightness_change, event_loss
 from edslam_ti.output import atomic_file
 from edslam_ti.pipeline import make_slam
@@ -35,10 +37,12 @@ from kernels.benchmark import (
     surface,
     tracking,
 )
+from kernels.view_losses import compare_change
 
 WARM_UP_FRAMES = 3
 MOTION = (0.01, 0.0, 0.005)  # metres between the two views of a mapping step
 EPSILON, BACKGROUND = 0.004, 0.5
+EVENT_FLOOR = 1e-3  # that of losses.event_loss
 
 
 def rows(
@@ -87,43 +91,52 @@ def write(
 
 
 def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
-    """Two views, event loss, gradients of the map and of both poses, Adam."""
+    """Two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam."""
     (means, _, scales, _, colors, pose), intrinsics = room_scene(count, *size)
     camera = Camera(*size, *intrinsics)
     gaussians = GaussianMap(Config().mapping)
     gaussians.add(means, scales, 0.7, colors)
-    starts = [torch.linalg.inv(pose).double(), torch.linalg.inv(pose).double()]
-    starts[1][:3, 3] += torch.tensor(MOTION)
+    moved = pose.clone()
+    moved[:3, 3] -= torch.tensor(MOTION)
+    poses = torch.stack([pose, moved])  # T_camera_world
     measured = 0.1 * torch.randn(size[1], size[0], generator=torch.Generator().manual_seed(0))
+    scale = 1 / (measured.numel() * (float(measured.square().mean()) + EVENT_FLOOR))
 
-    def by_pairs(T_world_camera: torch.Tensor) -> torch.Tensor:
+    def in_one_pass() -> None:
         drawn = gaussians.activated()
-        image, _, alpha = rasterize_pairs(
+        compare_change(
             drawn.means, drawn.quats, drawn.scales, drawn.opacities, drawn.colors,
-            torch.linalg.inv(T_world_camera).float(), intrinsics, size,
+            poses.clone().requires_grad_(), intrinsics, size, measured, BACKGROUND, EPSILON, scale,
+        ).loss.backward()  # fmt: skip
+        gaussians.step()
+
+    def by_pairs(drawn: Gaussians, T_camera_world: Tensor) -> Tensor:
+        image, _, alpha = rasterize_pairs(
+            drawn.means, drawn.quats, drawn.scales, drawn.opacities, drawn.colors, T_camera_world,
+            intrinsics, size,
         )  # fmt: skip
         return image[..., 0] + (1 - alpha) * BACKGROUND
 
-    def by_kernels(T_world_camera: torch.Tensor) -> torch.Tensor:
-        return render(gaussians.activated(), camera, T_world_camera, BACKGROUND).intensity
+    def by_kernels(drawn: Gaussians, T_camera_world: Tensor) -> Tensor:
+        return render(drawn, camera, inverse(T_camera_world), BACKGROUND).intensity
 
-    def step(view: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        poses = [T.clone().requires_grad_() for T in starts]
-        predicted = brightness_change(view(poses[0]), view(poses[1]), EPSILON)
+    def by_autograd(view: Callable[[Gaussians, Tensor], Tensor]) -> None:
+        drawn, free = gaussians.activated(), poses.clone().requires_grad_()
+        predicted = brightness_change(view(drawn, free[0]), view(drawn, free[1]), EPSILON)
         event_loss(predicted, measured).backward()
         gaussians.step()
 
-    def renders(view: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        for T in starts:
-            image = view(T.clone().requires_grad_())
-            image.backward(measured)
+    def renders() -> None:
+        for T in poses:
+            by_kernels(gaussians.activated(), T.clone().requires_grad_()).backward(measured)
         for value in gaussians.raw.values():
             value.grad = None
 
     candidates = {
-        OURS: lambda: step(by_kernels),
-        "Taichi, its two renders with gradients": lambda: renders(by_kernels),
-        "torch pair list": lambda: step(by_pairs),
+        OURS: in_one_pass,
+        "Taichi, two renders with gradients alone": renders,
+        "Taichi, two renders compared by torch": lambda: by_autograd(by_kernels),
+        "torch pair list": lambda: by_autograd(by_pairs),
     }
     task = f"{size[0]}x{size[1]}, {count} Gaussians: mapping step"
     yield from watch.compare("mapping_step", task, candidates)

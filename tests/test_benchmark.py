@@ -10,10 +10,13 @@ import torch
 
 import edslam_ti.benchmark
 from apps.benchmark import main
-from edslam_ti.benchmark import Curve, slam
+from edslam_ti.benchmark import Curve, mapping_step, slam
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import EdSlamError
+from edslam_ti.gaussians import GaussianMap
 from kernels.benchmark import (
+    Row,
+    Stopwatch,
     count_pairs,
     linearise_in_numpy,
     linearise_in_torch,
@@ -61,6 +64,32 @@ def test_pairs_are_counted_as_the_pair_list_lists_them() -> None:
     listed = int(((0.9 * torch.exp(-power) >= MIN_ALPHA) & (depths > 0.05)).sum())
     counted = count_pairs([means, quats, scales, opaque, colors, pose], intrinsics, (64, 48))
     assert counted == pytest.approx(listed, rel=0.1)  # those cut by the border count whole
+
+
+def test_ways_of_a_mapping_step_take_the_same_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    gradients: dict[str, dict[str, torch.Tensor]] = {}
+    current = [""]
+
+    def compare(suite: str, task: str, candidates: dict[str, Callable[[], None]]) -> list[Row]:
+        for name, run in candidates.items():
+            current[0] = name
+            run()
+        return []
+
+    def recording(gaussians: GaussianMap) -> None:
+        gradients[current[0]] = {k: v.grad.clone() for k, v in gaussians.raw.items() if v.grad is not None}
+        for value in gaussians.raw.values():
+            value.grad = None
+
+    monkeypatch.setattr(GaussianMap, "step", recording)
+    watch = Stopwatch(1)
+    monkeypatch.setattr(watch, "compare", compare)
+    list(mapping_step((40, 30), 200, watch))
+    ours, *others = gradients.values()
+    assert len(others) == 2
+    for other in others:
+        for name in ("means", "log_scales", "logit_opacities", "logit_colors"):
+            assert float((ours[name] - other[name]).norm() / other[name].norm()) < 5e-3
 
 
 def test_exponent_is_the_slope_of_the_logarithms() -> None:
