@@ -6,7 +6,8 @@ camera: unbiased where time surfaces (Eq. 5) lag behind their edges, and possibl
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -40,7 +41,9 @@ MAX_MISFITS = 4  # such frames in a row after which the image is given up
 REVISIT_OVERLAP = 0.6  # share of an old keyframe's pixels that must be in view again
 REVISIT_MISFIT = 0.12  # log brightness, median
 REVISIT_DISTANCE, REVISIT_ANGLE = 0.3, 15.0  # metres, degrees: larger corrections are not believed
+COAST_DISTANCE, COAST_ANGLE = 0.02, 2.0  # metres, degrees: depth alone has done no better than a guess
 MAX_REVISITS = 3  # old keyframes compared with a new one
+MAX_RECOGNISED = 20  # old keyframes searched after a gap
 MIN_MATCHES = 15  # features that must agree for a keyframe to be recognised
 
 
@@ -108,12 +111,13 @@ class BrightnessTracker:
             depth_sigma_2=config.depth_sigma_2,
             huber_threshold=config.huber_threshold,
         )
+        self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
         self._change = BrightnessChange(camera.shape)
         self._stretch, self._stretch_start = 0, 0  # number and first frame of the stretch of events
         self._moments: list[_Moment] = []  # the last frames of the stretch
         self._keyframe: _Keyframe | None = None  # None: no image yet
         self._old_keyframes: list[_Keyframe] = []
-        self._anchor: Frame | None = None  # the last frame with depth and events
+        self._is_silent, self._silent_since = False, 0  # events are missing; first such frame
         self._usual_events = 0.0
         self._num_misfits = 0
         self._path = _Path(Trajectory())
@@ -124,16 +128,21 @@ class BrightnessTracker:
         note = "" if len(trajectory) == 0 else self._noticed_gap(frame, guess)
         moment = self._take_in(frame, len(trajectory))
         if self._keyframe is None:
-            result = self._surface_tracker.track(frame, guess, trajectory)
+            if self._is_silent:
+                result = self._coast(moment, guess)
+                if frame.depth is not None and len(frame.events) >= SILENT_SHARE * self._usual_events:
+                    # Surfaces from before the gap are no reference: the pose may have drifted.
+                    self._surface_tracker.refer_to(frame)
+                    self._is_silent = False
+            else:
+                result = self._surface_tracker.track(frame, guess, trajectory)
             self._path.newest = result.T_world_camera
-            if self._begin():
-                note = note or self._revisit() or "first brightness image"
+            if not self._is_silent and self._begin():
+                note = self._relocalise()
         else:
             result, overlap = self._follow(moment, guess)
             self._path.newest = result.T_world_camera
             note = note or self._keep_up(moment, result.converged, overlap)
-        if frame.depth is not None and len(frame.events):
-            self._anchor = frame
         message = result.message or note
         return TrackingResult(self._path.newest, result.converged, result.quality, message)
 
@@ -157,7 +166,7 @@ class BrightnessTracker:
         if self._keyframe is None:
             self._begin_stretch(len(self._path.trajectory))
             return ""
-        flow = self._flow(self._keyframe.depth, self._path.pose(-1), guess)
+        flow = self._flow(self._keyframe.depth, self._path.pose(len(self._path.trajectory) - 1), guess)
         if flow < SILENT_FLOW:
             return ""  # the camera has stopped: its image stays as it is
         self._give_up_image()
@@ -167,15 +176,27 @@ class BrightnessTracker:
         assert self._keyframe is not None
         self._old_keyframes.append(self._keyframe)
         self._keyframe = None
+        self._is_silent, self._silent_since = True, len(self._path.trajectory)
         self._begin_stretch(len(self._path.trajectory))
-        if self._anchor is not None:
-            self._surface_tracker.refer_to(self._anchor)
 
     def _begin_stretch(self, index: int) -> None:
         self._stretch, self._stretch_start = self._stretch + 1, index
         self._change.reset()
         self._moments = []
         self._num_misfits = 0
+
+    def _coast(self, moment: _Moment, guess: np.ndarray) -> TrackingResult:
+        """Align depth alone to the last keyframe's."""
+        depth = moment.depth
+        if depth is None or not depth.any():
+            return TrackingResult(guess, False, 0.0, "too few events, and no depth to align instead")
+        old, T = self._old_keyframes[-1], guess
+        for level, image in ((1, downscaled_depth(depth)), (0, depth)):
+            linearise = self._linearised(old, self._depth_only, [np.zeros_like(image), image], level)
+            T, system = levenberg_marquardt(linearise, T, self._config.iterations)
+        if system.num_depth < MIN_PIXELS:
+            return TrackingResult(guess, False, 0.0, "too few events, and depth does not overlap")
+        return TrackingResult(orthonormalized(T), True, 0.5 * system.num_depth / system.num_usable)
 
     # --- the first image of a stretch ---
 
@@ -322,25 +343,36 @@ class BrightnessTracker:
         """Align an image, and its depth where there is any, to a keyframe, coarse to fine."""
         if depth is None:
             depth = np.zeros_like(image)
-        T_world_keyframe = self._path.pose(keyframe.index)
-        views = [cv2.merge([image, depth]), cv2.merge([downscaled(image), downscaled_depth(depth)])]
         T = start
-        for level in (1, 0):
-            alignment = Alignment(
-                [Direction(keyframe.points[level], 0, self._model)], views[level][None],
-                self._cameras[level].intrinsics,
-            )  # fmt: skip
-
-            def linearise(T_world_camera: np.ndarray, alignment: Alignment = alignment) -> NormalEquations:
-                # T exp(xi) moves T_camera_keyframe to exp(-xi) T_camera_keyframe
-                (system,) = alignment.linearise([rigid_inverse(T_world_camera) @ T_world_keyframe])
-                return system.transformed(-np.eye(6))
-
+        for level, view in ((1, [downscaled(image), downscaled_depth(depth)]), (0, [image, depth])):
+            linearise = self._linearised(keyframe, self._model, view, level)
             T, system = levenberg_marquardt(linearise, T, self._config.iterations)
         T = orthonormalized(T)
         difference = self._difference(keyframe, image, T)
         misfit = float(np.median(np.abs(difference))) if len(difference) else np.inf
         return _Aligned(T, system, misfit)
+
+    def _linearised(
+        self,
+        keyframe: _Keyframe,
+        model: ResidualModel,
+        view: list[np.ndarray],  # log brightness and depth at that size
+        level: int,
+    ) -> Callable[[np.ndarray], NormalEquations]:
+        """Return the normal equations of alignment to a keyframe as a function of T_world_camera."""
+        alignment = Alignment(
+            [Direction(keyframe.points[level], 0, model)],
+            cv2.merge(view)[None],
+            self._cameras[level].intrinsics,
+        )
+        T_world_keyframe = self._path.pose(keyframe.index)
+
+        def linearise(T_world_camera: np.ndarray) -> NormalEquations:
+            # T exp(xi) moves T_camera_keyframe to exp(-xi) T_camera_keyframe
+            (system,) = alignment.linearise([rigid_inverse(T_world_camera) @ T_world_keyframe])
+            return system.transformed(-np.eye(6))
+
+        return linearise
 
     def _difference(self, keyframe: _Keyframe, image: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
         """Return an image less a keyframe's, at pixels of the keyframe in view (nearest neighbours)."""
@@ -370,24 +402,28 @@ class BrightnessTracker:
         keyframe = self._keyframe
         assert keyframe is not None
         T_now = self._path.pose(keyframe.index)
-        is_new_stretch = all(old.stretch != keyframe.stretch for old in self._old_keyframes)
-        num_compared = 0
-        for old in self._old_keyframes:  # the oldest has drifted least
-            if not is_new_stretch and keyframe.index - old.index < 2 * WINDOW:
-                break
-            if self._share_in_view(old, T_now) < REVISIT_OVERLAP:
-                continue
-            num_compared += 1
-            aligned = self._compared(old, keyframe, T_now)
-            if aligned is None and is_new_stretch:
-                recognised = self._recognised(old, keyframe)
-                aligned = None if recognised is None else self._compared(old, keyframe, recognised)
-            if aligned is not None:
-                self._correct(aligned.T_world_camera, old, is_new_stretch)
+        old_enough = [k for k in self._old_keyframes if keyframe.index - k.index >= 2 * WINDOW]
+        in_view = [k for k in old_enough if self._share_in_view(k, T_now) >= REVISIT_OVERLAP]
+        for old in in_view[:MAX_REVISITS]:  # the oldest has drifted least
+            T = self._compared(old, keyframe, T_now)
+            if T is not None and _is_near(rigid_inverse(T_now) @ T, REVISIT_DISTANCE, REVISIT_ANGLE):
+                self._correct(T, old.index, keyframe.index)
                 return f"place of frame {old.index} seen again"
-            if num_compared == MAX_REVISITS:
-                break
         return ""
+
+    def _relocalise(self) -> str:
+        """Find the first keyframe of a stretch among the older ones; return what happened."""
+        keyframe = self._keyframe
+        assert keyframe is not None
+        T_now = self._path.pose(keyframe.index)
+        newest_first = self._old_keyframes[::-1]
+        for old in newest_first[:MAX_RECOGNISED]:
+            for start in (self._recognised(old, keyframe), T_now):
+                T = None if start is None else self._compared(old, keyframe, start)
+                if T is not None:
+                    self._bridge(T)
+                    return f"relocalised by the place of frame {old.index}"
+        return "no place recognised" if newest_first else "first brightness image"
 
     def _share_in_view(self, old: _Keyframe, T_world_camera: np.ndarray) -> float:
         camera = self._cameras[0]
@@ -395,7 +431,7 @@ class BrightnessTracker:
         inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
         return float(inside.sum() / max(np.count_nonzero(old.depth[::2, ::2]), 1))
 
-    def _compared(self, old: _Keyframe, new: _Keyframe, start: np.ndarray) -> _Aligned | None:
+    def _compared(self, old: _Keyframe, new: _Keyframe, start: np.ndarray) -> np.ndarray | None:
         """Return the new keyframe's pose by alignment to an older one, or None where they do not match."""
         T = start
         for _ in range(2):  # images are known up to an offset
@@ -405,15 +441,8 @@ class BrightnessTracker:
             image = new.log_brightness - np.float32(np.median(difference))
             aligned = self._align(old, image, new.depth, T)
             T = aligned.T_world_camera
-        correction = rigid_inverse(self._path.pose(new.index)) @ T
-        is_credible = (
-            self._judged(aligned, start).converged
-            and aligned.misfit < REVISIT_MISFIT
-            and aligned.overlap > REVISIT_OVERLAP
-            and float(np.linalg.norm(correction[:3, 3])) < REVISIT_DISTANCE
-            and rotation_angle_deg(correction) < REVISIT_ANGLE
-        )
-        return aligned if is_credible else None
+        is_same = self._judged(aligned, start).converged and aligned.misfit < REVISIT_MISFIT
+        return T if is_same and aligned.overlap > REVISIT_OVERLAP / 2 else None
 
     def _recognised(self, old: _Keyframe, new: _Keyframe) -> np.ndarray | None:  # [4, 4]
         """Return the new keyframe's pose by features matched with an older one (SIFT, PnP), or None."""
@@ -443,16 +472,45 @@ class BrightnessTracker:
         T_new_old[:3, :3], T_new_old[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
         return self._path.pose(old.index) @ rigid_inverse(T_new_old)
 
-    def _correct(self, T_world_camera: np.ndarray, old: _Keyframe, is_new_stretch: bool) -> None:
-        """Move the keyframe to its corrected pose, later frames with it, and those since `old` in part."""
+    def _correct(self, T_world_camera: np.ndarray, start: int, end: int) -> None:
+        """Move the keyframe to its pose: frames from `end` on with it, those since `start` in part."""
         keyframe = self._keyframe
         assert keyframe is not None
         twist = log_vector(T_world_camera @ rigid_inverse(self._path.pose(keyframe.index)))
-        end = self._stretch_start if is_new_stretch else keyframe.index
-        start = max((k.index for k in self._old_keyframes), default=0) if is_new_stretch else old.index
         for index in range(start + 1, len(self._path)):
             share = min(1.0, (index - start) / max(end - start, 1))
             self._path.replace(index, exp_matrix(share * twist) @ self._path.pose(index))
+
+    def _bridge(self, T_world_camera: np.ndarray) -> None:
+        """Move a stretch so that its keyframe is at the given pose, and the gap before it in between.
+
+        Depth alone has carried the camera through the gap. Where the end shows that it did not, as along
+        a plain wall, the poses inside become a cubic between the ends and their velocities.
+        """
+        keyframe = self._keyframe
+        assert keyframe is not None
+        first, last = self._silent_since - 1, self._stretch_start  # the last frame before, the first after
+        correction = T_world_camera @ rigid_inverse(self._path.pose(keyframe.index))
+        for index in range(last, len(self._path)):
+            self._path.replace(index, correction @ self._path.pose(index))
+        if _is_near(correction, COAST_DISTANCE, COAST_ANGLE) or first < 1:
+            twist = log_vector(correction)
+            for index in range(first + 1, last):
+                share = (index - first) / (last - first)
+                self._path.replace(index, exp_matrix(share * twist) @ self._path.pose(index))
+            return
+        start, n = self._path.pose(first), last - first
+        across = log_vector(rigid_inverse(start) @ self._path.pose(last))
+        before = n * log_vector(rigid_inverse(self._path.pose(first - 1)) @ start)
+        after = n * log_vector(rigid_inverse(self._path.pose(last)) @ self._path.pose(last + 1))
+        for index in range(first + 1, last):
+            u = (index - first) / n
+            twist = u * (1 - u) ** 2 * before + u**2 * (3 - 2 * u) * across - u**2 * (1 - u) * after
+            self._path.replace(index, start @ exp_matrix(twist))
+
+
+def _is_near(correction: np.ndarray, distance: float, angle: float) -> bool:  # [4, 4], metres, degrees
+    return float(np.linalg.norm(correction[:3, 3])) < distance and rotation_angle_deg(correction) < angle
 
 
 class _Path:
