@@ -142,7 +142,7 @@ def run_all(
     A case that fails is recorded with its `error`, one whose data or library is absent as `skipped`; the
     rest go on, and the next call tries those again.
     """
-    kernels.init("cpu", threads=threads)
+    is_started = False
     with _progress(console) as bar:
         task = bar.add_task("bench", total=len(cases) * len(variants), status="")
 
@@ -155,6 +155,9 @@ def run_all(
                 file = result_file(out, case, variant)
                 result = None if fresh else _kept(file)
                 if result is None:
+                    if not is_started:  # tables alone need no kernels
+                        kernels.init("cpu", threads=threads)
+                        is_started = True
                     if opened is None:
                         opened = _opened(recordings, recording, report)
                     if isinstance(opened, dict):
