@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from kernels import reference
+from kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from kernels.patch_warp import (
     NEAR,
     Alignment,
@@ -31,7 +32,7 @@ from kernels.patch_warp import (
     extract_patches,
 )
 from kernels.projection import MIN_ALPHA
-from kernels.rasterization import MAX_ALPHA, MIN_TRANSMITTANCE, rasterize
+from kernels.rasterization import rasterize
 from kernels.time_surface import time_surface, update_last_timestamps
 
 OURS = "Taichi"

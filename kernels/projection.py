@@ -411,7 +411,7 @@ class Projection:
     """One map as several views see it; index v * padded + i is Gaussian i in view v."""
 
     count: int  # Gaussians
-    gaussians: Tensor  # [COLOR + C, G, LANES]
+    gaussians: Tensor  # [COLOR + C, G, LANES], or [COLOR + C, N] of kernels.pixels
     poses: Tensor  # [V, 4, 4]
     intrinsics: tuple[float, float, float, float]
     low_pass: float
@@ -427,7 +427,7 @@ class Projection:
     @property
     def padded(self) -> int:
         """Number of Gaussians, rounded up to full lanes."""
-        return self.gaussians.shape[1] * LANES
+        return self.gaussians.numel() // len(self.gaussians)
 
 
 def padded_to_lanes(name: str, table: Tensor) -> Tensor:  # [N, ...] -> [padded, ...]

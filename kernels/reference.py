@@ -7,9 +7,10 @@ backward passes.
 import torch
 from torch import Tensor
 
+from kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE
 from kernels.patch_warp import ResidualModel
 from kernels.projection import LOW_PASS, MIN_ALPHA, NEAR
-from kernels.rasterization import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE, Rasterization
+from kernels.rasterization import Rasterization
 
 # --- time surface ---
 

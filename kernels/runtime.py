@@ -63,6 +63,11 @@ def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:
     )
 
 
+def is_gpu() -> bool:
+    """Return whether Taichi was started on a GPU."""
+    return ti.cfg.arch == ti.cuda
+
+
 def workers() -> int:
     """Return the number of CPU workers Taichi was started with."""
     return int(ti.cfg.cpu_max_num_threads)

@@ -16,6 +16,16 @@ import taichi as ti
 import torch
 from torch import Tensor
 
+from kernels.compositing import (
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    clear,
+    fill_slots,
+    lane_columns,
+    lane_rows,
+    list_blocks,
+    log_255_alpha,
+)
 from kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions
 from kernels.projection import (
     BLOCK,
@@ -29,22 +39,15 @@ from kernels.projection import (
     project_backward,
 )
 from kernels.rasterization import (
-    MAX_ALPHA,
-    MIN_TRANSMITTANCE,
     TILE,
     Workspace,
     check_gaussians,
     check_tile,
-    clear,
-    fill_slots,
     from_blocks,
-    lane_columns,
-    lane_rows,
-    list_blocks,
-    log_255_alpha,
+    rasterize,
     to_blocks,
 )
-from kernels.runtime import CHUNK, check_shape, plain
+from kernels.runtime import CHUNK, check_shape, is_gpu, plain
 from kernels.tile_lists import list_pairs
 
 ALPHA, WEIGHT = 0, 1  # what is kept of every record that a block draws
@@ -261,12 +264,13 @@ def compare_change(
     scale: float,  # of the sum of squares
     low_pass: float = LOW_PASS,
     tile: int = TILE,
+    pixelwise: bool | None = None,  # render a pixel per thread and compare in torch; None: on a GPU
 ) -> Comparison:
     """Return `scale` times the squared error of the brightness change between two views, Eq. 10-12."""
     check_shape("T_camera_world", T_camera_world, (2, 4, 4))
     return _compare(
         means, quats, scales, opacities, colors, T_camera_world, intrinsics, size,
-        measured, torch.zeros_like(measured), (scale, 0.0), background, epsilon, low_pass, tile,
+        measured, torch.zeros_like(measured), (scale, 0.0), background, epsilon, low_pass, tile, pixelwise,
     )  # fmt: skip
 
 
@@ -287,12 +291,13 @@ def compare_view(
     depth_scale: float,  # of the sum of absolute depth errors
     low_pass: float = LOW_PASS,
     tile: int = TILE,
+    pixelwise: bool | None = None,  # render a pixel per thread and compare in torch; None: on a GPU
 ) -> Comparison:
     """Return how much a view differs from a target, in brightness squared and in depth."""
     check_shape("T_camera_world", T_camera_world, (4, 4))
     return _compare(
         means, quats, scales, opacities, colors, T_camera_world[None], intrinsics, size,
-        log_brightness, depth, (scale, depth_scale), background, epsilon, low_pass, tile,
+        log_brightness, depth, (scale, depth_scale), background, epsilon, low_pass, tile, pixelwise,
     )  # fmt: skip
 
 
@@ -300,15 +305,38 @@ def _compare(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, poses: Tensor,
     intrinsics: tuple[float, float, float, float], size: tuple[int, int],
     target: Tensor, target_depth: Tensor, weights: tuple[float, float],
-    background: float, epsilon: float, low_pass: float, tile: int,
+    background: float, epsilon: float, low_pass: float, tile: int, pixelwise: bool | None,
 ) -> Comparison:  # fmt: skip
     check_gaussians(means, quats, scales, opacities, colors)
     check_shape("colors", colors, (len(means), 1))
     check_shape("target", target, (size[1], size[0]))
     check_shape("depth", target_depth, (size[1], size[0]))
     check_tile(tile, size)
+    if is_gpu() if pixelwise is None else pixelwise:
+        return _compare_rendered(
+            (means, quats, scales, opacities, colors), poses, intrinsics, size,
+            target, target_depth, weights, background, epsilon, low_pass,
+        )  # fmt: skip
     outputs = _CompareViews.apply(
         means, quats, scales, opacities, colors, poses, tuple(intrinsics), tuple(size),
         target, target_depth, weights, background, epsilon, low_pass, tile,
     )  # fmt: skip
     return Comparison(*outputs)
+
+
+def _compare_rendered(
+    gaussians: tuple[Tensor, ...], poses: Tensor,
+    intrinsics: tuple[float, float, float, float], size: tuple[int, int],
+    target: Tensor, target_depth: Tensor, weights: tuple[float, float],
+    background: float, epsilon: float, low_pass: float,
+) -> Comparison:  # fmt: skip
+    views = [
+        rasterize(*gaussians, pose, intrinsics, size, low_pass=low_pass, pixelwise=True) for pose in poses
+    ]
+    logs = [torch.log(view.image[..., 0] + (1 - view.alpha) * background + epsilon) for view in views]
+    difference = (logs[0] if len(logs) == 1 else logs[1] - logs[0]) - target
+    loss = weights[0] * difference.square().sum()
+    if len(views) == 1:
+        error = (views[0].depth - target_depth).abs()
+        loss = loss + weights[1] * torch.where(target_depth > 0, error, 0).sum()
+    return Comparison(loss, difference.detach())

@@ -74,17 +74,20 @@ def change(inputs: list[torch.Tensor], measured: torch.Tensor, scale: float, **o
     return compare_change(*inputs, INTRINSICS, SIZE, measured, BACKGROUND, EPSILON, scale, **options).loss
 
 
-def test_change_between_two_views_matches_rendering_them() -> None:
+@pytest.mark.parametrize("pixelwise", [False, True])
+def test_change_between_two_views_matches_rendering_them(pixelwise: bool) -> None:
     inputs, (measured, _) = [*make_map(300), make_poses()], images()
-    ours = with_gradients(3 * change(inputs, measured, 0.5), inputs)
+    ours = with_gradients(3 * change(inputs, measured, 0.5, pixelwise=pixelwise), inputs)
     assert_same(ours, with_gradients(change_twin(rasterize, inputs, measured, 1.5), inputs), 2e-5)
 
 
-def test_one_view_with_depth_matches_rendering_it() -> None:
+@pytest.mark.parametrize("pixelwise", [False, True])
+def test_one_view_with_depth_matches_rendering_it(pixelwise: bool) -> None:
     inputs, (target, depth) = [*make_map(300), make_poses()], images()
     result = compare_view(
-        *inputs[:-1], inputs[-1][0], INTRINSICS, SIZE, target, depth, BACKGROUND, EPSILON, 0.7, 0.2
-    )
+        *inputs[:-1], inputs[-1][0], INTRINSICS, SIZE, target, depth, BACKGROUND, EPSILON, 0.7, 0.2,
+        pixelwise=pixelwise,
+    )  # fmt: skip
     theirs = with_gradients(view_twin(rasterize, inputs, target, depth), inputs)
     assert_same(with_gradients(result.loss, inputs), theirs, 2e-5)
     depth_error = (
