@@ -1,9 +1,9 @@
 """Rendering with one Gaussian, and then one pixel, per thread: the way of a GPU.
 
 The functions are those of the CPU's path (kernels.projection, kernels.compositing), applied to numbers
-instead of lanes of vectors. A thread walks its tile's whole list, and adds to the slots of gradients atomically,
-so that sums may differ in their last bits from run to run. Sorting and prefix sums are torch's, on the device;
-the number of (Gaussian, tile) pairs is read back once a view, to allocate their lists.
+instead of lanes of vectors. A thread walks its tile's whole list, and adds to the slots of gradients
+atomically, so that sums may differ in their last bits from run to run. Sorting and prefix sums are torch's,
+on the device; the number of (Gaussian, tile) pairs is read back once a view, to allocate their lists.
 """
 
 import taichi as ti
