@@ -93,10 +93,10 @@ def write(
 
 def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
     """Two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam."""
-    (means, _, scales, _, colors, pose), intrinsics = room_scene(count, *size)
+    (means, quats, scales, _, colors, pose), intrinsics = room_scene(count, *size)
     camera = Camera(*size, *intrinsics)
     gaussians = GaussianMap(Config().mapping)
-    gaussians.add(means, scales, 0.7, colors)
+    gaussians.add(means, quats, scales, 0.7, colors)
     moved = pose.clone()
     moved[:3, 3] -= torch.tensor(MOTION)
     poses = torch.stack([pose, moved])  # T_camera_world

@@ -96,7 +96,9 @@ class MappingConfig(Stage):
     """lambda_MDE of Eq. 13: so many median depth errors also ask for new Gaussians (Sec. IV-A)."""
     max_gaussians: int = Field(200_000, ge=1)
     """No Gaussians are added beyond this."""
-    initial_opacity: float = Field(0.9, gt=0, lt=1)
+    initial_size: float = Field(0.25, gt=0)
+    """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
+    initial_opacity: float = Field(0.95, gt=0, lt=1)
     """Opacity of a new Gaussian."""
     min_opacity: float = Field(0.05, ge=0, lt=1)
     """Gaussians that have become fainter are pruned."""
@@ -122,11 +124,11 @@ class MappingConfig(Stage):
     """Adam's learning rate of the means, metres."""
     quats_rate: float = Field(1e-3, gt=0)
     """Adam's learning rate of the quaternions (gsplat)."""
-    scales_rate: float = Field(5e-3, gt=0)
-    """Adam's learning rate of the log-scales (gsplat)."""
-    opacities_rate: float = Field(2e-2, gt=0)
+    scales_rate: float = Field(1e-2, gt=0)
+    """Adam's learning rate of the log-scales (gsplat: 5e-3)."""
+    opacities_rate: float = Field(5e-2, gt=0)
     """Adam's learning rate of the opacity logits."""
-    colors_rate: float = Field(3e-2, gt=0)
+    colors_rate: float = Field(6e-2, gt=0)
     """Adam's learning rate of the brightness logits."""
     brightness_cells: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.8)
     """Edge lengths in metres of cells whose Gaussians share a brightness offset. Events tie brightness

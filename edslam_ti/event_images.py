@@ -14,7 +14,7 @@ from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
 QUICK = {4: 60}  # iterations of the solution by reduction of the images, during the run
-THOROUGH = {4: 100, 2: 50}  # the same at the end
+THOROUGH = {4: 100, 2: 80}  # the same at the end
 GIVEN_VIEWS = 6  # frames of earlier stretches that a start image is tied to
 DETAIL_SIGMA = 4.0  # px; smaller details of the start image come from the map
 DETAIL_RATE = 0.1  # share of a view's difference that they take over
@@ -60,7 +60,6 @@ class EventImages:
         if not frame.is_held_out:
             self._depths[index] = frame.depth
         if not self._stretches:
-            self._archive.begin_again()
             level = np.float32(np.log(self._config.background))
             self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
         elif frame.timestamp - self._started > self._config.stretch:
@@ -77,11 +76,10 @@ class EventImages:
         iterations = THOROUGH if is_thorough else QUICK
         for stretch in stretches:
             own = [k for k in self.frames if self._stretch(k) is stretch]
-            if len(own) < MIN_VIEWS:
+            given = [k for k in self.frames if k < stretch.first][-GIVEN_VIEWS:] if self.is_solved else []
+            if not own or len(own) + len(given) < MIN_VIEWS:
                 continue
-            other = [k for k in self.frames if k < own[0]] if self.is_solved else []
             chosen = _evenly(own, self._config.solved_views)
-            given = other[-GIVEN_VIEWS:]
             views = [self._view(k, trajectory, is_relative=k in chosen) for k in given + chosen]
             solved = solve_start_image(views, self._camera, stretch.start, iterations)
             if not given:  # nothing says what the level is: let it be as it was
@@ -109,13 +107,16 @@ class EventImages:
         return shift
 
     def thin_out(self, keep: set[int]) -> None:
-        """Forget every other of the older frames beyond the largest number kept, but none of `keep`."""
-        frames = self.frames
-        if len(frames) > self._config.max_views:
-            for k in frames[1 : len(frames) // 2 : 2]:
-                if k not in keep:
-                    self._archive.forget(k)
-                    del self._depths[k]
+        """Forget frames beyond the largest number kept: where they are densest, those of `keep` last.
+
+        The newer half stays complete.
+        """
+        while len(frames := self.frames) > self._config.max_views:
+            older = range(1, max(2, len(frames) // 2))
+            candidates = [i for i in older if frames[i] not in keep] or list(older)
+            densest = min(candidates, key=lambda i: frames[i + 1] - frames[i - 1])
+            self._archive.forget(frames[densest])
+            del self._depths[frames[densest]]
 
     def _begin(self, first: int, time: float, start: np.ndarray) -> None:
         self._stretches.append(_Stretch(first, start.astype(np.float32)))

@@ -77,6 +77,7 @@ class GaussianMap:
     def add(
         self,
         means: Tensor,  # [M, 3] metres
+        quats: Tensor,  # [M, 4] wxyz
         scales: Tensor,  # [M, 3] metres
         opacity: float,
         colors: Tensor,  # [M, 1] in (0, 1)
@@ -88,7 +89,7 @@ class GaussianMap:
         self._cells = torch.cat([self._cells, cells])
         new = {
             "means": means,
-            "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(m, 1),
+            "quats": quats,
             "log_scales": scales.log(),
             "logit_opacities": torch.full((m,), opacity).logit(),
             "logit_colors": _logit(colors) - shared,

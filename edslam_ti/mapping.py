@@ -15,15 +15,17 @@ from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
-from edslam_ti.pointcloud import depth_to_points
+from edslam_ti.pointcloud import depth_to_points, surface_discs
 from edslam_ti.rendering import RenderOutput, View, render, render_view
 from edslam_ti.trajectory import Trajectory
 
 Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
 
 ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
-WHITE = 0.98  # brightness given to the brightest percent of pixels
+WHITE = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between solutions of the start image
+FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
+MAX_STRETCH = 4.0  # of a new Gaussian on a surface that falls away
 EVENT_VARIANCE = 0.1  # squared log brightness: scale of the event loss
 
 
@@ -202,14 +204,18 @@ class GaussianMapper:
         if len(points) == 0:
             return
         x, y = pixels[:, 0], pixels[:, 1]
-        size = 0.6 * s * frame.depth[y, x] / self._camera.fx  # just overlapping at the block's spacing
+        # Discs on the surface; small ones sharpen faster than large ones shrink, and Eq. 13 fills the gaps.
+        size = config.initial_size * s * frame.depth[y, x] / self._camera.fx
+        quats, stretch = surface_discs(frame.depth, self._camera, T_world_camera, pixels, MAX_STRETCH)
+        scales = size[:, None] * np.stack([np.ones_like(size), stretch, np.full_like(size, FLATNESS)], 1)
         if self.images.is_solved:
             brightness = np.exp(self.images.log_brightness(frame.index)[y, x]) - config.log_epsilon
         else:
             brightness = np.full(len(points), config.background)
         self.gaussians.add(
             torch.from_numpy(points.astype(np.float32)),
-            torch.from_numpy(size.astype(np.float32))[:, None].repeat(1, 3),
+            torch.from_numpy(quats),
+            torch.from_numpy(scales.astype(np.float32)),
             config.initial_opacity,
             torch.from_numpy(brightness.astype(np.float32))[:, None],
         )

@@ -38,6 +38,53 @@ def depth_to_points(
     return points, np.stack([x, y], -1)
 
 
+def surface_discs(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+    camera: Camera,
+    T_world_camera: np.ndarray,  # [4, 4]
+    pixels: np.ndarray,  # [N, 2] int64 (x, y)
+    max_stretch: float,
+) -> tuple[np.ndarray, np.ndarray]:  # [N, 4] float32 wxyz; [N] float32 >= 1
+    """Return the orientation of discs that lie on the surface, and how much longer than wide they must be.
+
+    The third axis is the normal; a disc seen as a circle is longer by the stretch, 1 / cosine of the tilt,
+    along the second axis. Where depth is missing beside a pixel, or jumps, the disc faces the camera.
+    """
+    from scipy.spatial.transform import Rotation
+
+    _check_image("depth", depth, camera)
+    x, y = pixels.T
+    all_rays = camera.rays()
+    points = all_rays * depth[..., None]
+    rays = _unit(all_rays[y, x])
+    normal = np.cross(_differences(points, depth, 1)[y, x], _differences(points, depth, 0)[y, x])
+    is_known = np.linalg.norm(normal, axis=-1, keepdims=True) > 1e-12
+    normal = _unit(np.where(is_known, normal, rays))
+    cosine = np.abs((normal * rays).sum(-1))
+    first = np.cross(normal, rays)
+    faces_camera = np.linalg.norm(first, axis=-1, keepdims=True) < 1e-3  # any first axis will do
+    first = _unit(np.where(faces_camera, np.cross(normal, [0.0, 1.0, 0.0]), first))
+    axes = np.stack([first, np.cross(normal, first), normal], -1)
+    x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3] @ axes).as_quat().T
+    stretch = 1 / np.maximum(cosine, 1 / max_stretch)
+    return np.stack([w, x, y, z], -1).astype(np.float32), stretch.astype(np.float32)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:  # [N, 3]
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _differences(points: np.ndarray, depth: np.ndarray, axis: int) -> np.ndarray:  # [H, W, 3]
+    """Return the difference of the points beside each, 0 at the rim and where depth is missing or jumps."""
+    result = np.zeros_like(points)
+    inner, before, after = ([slice(None), slice(None)] for _ in range(3))
+    inner[axis], before[axis], after[axis] = slice(1, -1), slice(None, -2), slice(2, None)
+    a, b, c = (depth[tuple(part)] for part in (before, inner, after))
+    is_smooth = (a > 0) & (b > 0) & (c > 0) & (np.abs(a + c - 2 * b) < 0.02 * b)
+    result[tuple(inner)] = np.where(is_smooth[..., None], points[tuple(after)] - points[tuple(before)], 0)
+    return result
+
+
 def _check_image(name: str, image: np.ndarray, camera: Camera) -> None:
     if image.shape != camera.shape:
         raise DataError(f"{name}: expected shape {camera.shape} as the camera's, got {image.shape}")

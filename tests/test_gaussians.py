@@ -17,13 +17,18 @@ RATES = {
 }
 
 
+def upright(count: int) -> Tensor:  # [count, 4] wxyz
+    """Return quaternions that turn nothing."""
+    return torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1)
+
+
 def add(gaussians: GaussianMap, count: int, seed: int = 0, opacity: float = 0.8) -> Tensor:
     """Add random Gaussians within a metre; returns their colours [count, 1]."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=generator) - 0.5
     scales = 0.01 + 0.02 * torch.rand(count, 3, generator=generator)
     colors = 0.1 + 0.8 * torch.rand(count, 1, generator=generator)
-    gaussians.add(means, scales, opacity, colors)
+    gaussians.add(means, upright(len(means)), scales, opacity, colors)
     return colors
 
 
@@ -56,7 +61,7 @@ def test_added_gaussians_are_what_was_asked_for() -> None:
     gaussians = GaussianMap(CONFIG)
     assert len(gaussians) == 0
     means, scales = torch.tensor([[0.1, 0.2, 1.0]]), torch.tensor([[0.01, 0.02, 0.03]])
-    gaussians.add(means, scales, 0.7, torch.tensor([[0.3]]))
+    gaussians.add(means, upright(1), scales, 0.7, torch.tensor([[0.3]]))
     shown = gaussians.activated()
     torch.testing.assert_close(shown.means.detach(), means)
     torch.testing.assert_close(shown.scales.detach(), scales)
@@ -124,7 +129,11 @@ def test_a_cell_moves_the_neighbours_of_the_gaussian_that_pulls() -> None:
     gaussians = GaussianMap(CONFIG)
     near, far = [0.01, 0.01, 0.01], [0.03, 0.03, 0.03]
     gaussians.add(
-        torch.tensor([near, far, [9.0, 9, 9]]), torch.full((3, 3), 0.01), 0.8, torch.full((3, 1), 0.5)
+        torch.tensor([near, far, [9.0, 9, 9]]),
+        upright(3),
+        torch.full((3, 3), 0.01),
+        0.8,
+        torch.full((3, 1), 0.5),
     )
     gaussians.activated().colors[0, 0].backward()
     gaussians.step()
@@ -175,7 +184,7 @@ def test_decayed_rates_shorten_the_steps_also_after_adding(grows_between: bool) 
 
 def test_extreme_brightness_stays_finite() -> None:
     gaussians = GaussianMap(CONFIG)
-    gaussians.add(torch.zeros(2, 3), torch.full((2, 3), 0.01), 0.5, torch.tensor([[0.0], [1.0]]))
+    gaussians.add(torch.zeros(2, 3), upright(2), torch.full((2, 3), 0.01), 0.5, torch.tensor([[0.0], [1.0]]))
     assert torch.isfinite(gaussians.raw["logit_colors"]).all()
     shown = gaussians.activated().colors.detach()
     torch.testing.assert_close(shown, torch.tensor([[0.0], [1.0]]), atol=1 / 255, rtol=0)  # a grey level

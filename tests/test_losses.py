@@ -23,7 +23,8 @@ def scattered_map() -> GaussianMap:
     )
     gaussians = GaussianMap(MappingConfig())
     scales = 0.02 + 0.08 * torch.rand(100, 3, generator=generator)
-    gaussians.add(means, scales, 0.7, torch.rand(100, 1, generator=generator))
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(100, 1)
+    gaussians.add(means, quats, scales, 0.7, torch.rand(100, 1, generator=generator))
     return gaussians
 
 

@@ -129,8 +129,8 @@ def test_mapped_pixels_get_no_second_gaussians(
     _, first = mapped(tiny_sequence, tiny_samples[:1])
     assert first.num_gaussians == 120 * 80 / 4
     _, all_of_them = mapped(tiny_sequence, tiny_samples, iterations=0)
-    # 14 views of nearly the same walls: what is new is the rim and behind edges.
-    assert first.num_gaussians < all_of_them.num_gaussians < 2 * first.num_gaussians
+    # 14 views of nearly the same walls: what is new is the gaps between small discs, the rim, behind edges.
+    assert first.num_gaussians < all_of_them.num_gaussians < 4 * first.num_gaussians
 
 
 def test_map_never_exceeds_its_largest_size(

@@ -5,7 +5,7 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.pointcloud import depth_to_points
+from edslam_ti.pointcloud import depth_to_points, surface_discs
 
 CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
 
@@ -63,3 +63,32 @@ def test_no_usable_depth_gives_empty_arrays() -> None:
 def test_depth_of_another_size_is_an_error() -> None:
     with pytest.raises(DataError, match=r"depth: expected shape \(6, 8\) .* got \(8, 6\)"):
         depth_to_points(random_depth().T, CAMERA, np.eye(4))
+
+
+def test_discs_lie_on_a_tilted_plane_and_look_round_from_the_camera() -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    normal = np.array([0.6, 0.0, -0.8])
+    depth = (-2.0 / (camera.rays() @ normal)).astype(np.float32)  # the plane 2 m away along its normal
+    T = pose()
+    pixels = np.array([[31, 23], [10, 40], [50, 5]])
+    quats, stretch = surface_discs(depth, camera, T, pixels, max_stretch=10.0)
+    for (x, y), (qw, qx, qy, qz), longer in zip(pixels, quats.astype(np.float64), stretch):
+        v, w = np.array([qx, qy, qz]), qw
+        axes = np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], -1)
+        np.testing.assert_allclose(np.abs(axes[:, 2] @ T[:3, :3] @ normal), 1.0, atol=1e-4)
+        ray = camera.rays()[y, x] / np.linalg.norm(camera.rays()[y, x])
+        across, along = (T[:3, :3].T @ axes[:, k] for k in (0, 1))
+        seen = [np.linalg.norm(a - (a @ ray) * ray) for a in (across, longer * along)]
+        np.testing.assert_allclose(seen, 1.0, atol=1e-3)  # a circle, seen along the ray
+
+
+def test_disc_beside_missing_depth_or_an_edge_faces_the_camera() -> None:
+    camera = Camera(20, 10, 20.0, 20.0, 9.5, 4.5)
+    depth = np.full(camera.shape, 2.0, np.float32)
+    depth[:, 10:] = 3.0
+    depth[5, 5] = 0
+    pixels = np.array([[9, 4], [4, 5], [0, 0]])
+    _, stretch = surface_discs(depth, camera, np.eye(4), pixels, max_stretch=4.0)
+    np.testing.assert_allclose(stretch, 1.0)
+    _, stretch = surface_discs(depth, camera, np.eye(4), np.array([[2, 2]]), max_stretch=4.0)
+    assert stretch[0] > 1  # seen from the side

@@ -20,13 +20,14 @@ def wall(depth: float, spacing: float = 0.05, brightness: float | None = None) -
     means = torch.stack([x.ravel(), y.ravel(), torch.full((x.numel(),), depth)], -1)
     scales = torch.full((len(means), 3), 0.6 * spacing)
     scales[:, 2] = 0.001
+    facing = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(len(means), 1)
     generator = torch.Generator().manual_seed(0)
     colors = (
         torch.rand(len(means), 1, generator=generator)
         if brightness is None
         else torch.full((len(means), 1), brightness)
     )
-    gaussians.add(means, scales, 0.95, colors)
+    gaussians.add(means, facing, scales, 0.95, colors)
     return gaussians
 
 

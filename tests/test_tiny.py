@@ -66,7 +66,8 @@ def moved(a: Sample, b: Sample) -> float:
 def test_gaussians_from_one_depth_image_render_it_back(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
-    slam = make_slam(tiny_sequence, tiny_samples, settings())
+    # Large enough to overlap; the default's gaps are filled by later frames.
+    slam = make_slam(tiny_sequence, tiny_samples, settings(mapping={"initial_size": 0.6}))
     slam.process(tiny_samples[0])
     assert isinstance(slam.mapper, GaussianMapper)
     assert slam.mapper.num_gaussians == 120 * 80 / 4  # one per 2x2 pixels

@@ -1,0 +1,86 @@
+"""Images from events in a tiny room: close to what a camera would have seen, over several stretches."""
+
+import numpy as np
+import pytest
+
+from edslam_ti.config import MappingConfig, TimeSurfaceConfig
+from edslam_ti.datasets import EventDepthSequence, Sample
+from edslam_ti.event_images import EventImages
+from edslam_ti.frame import FrameBuilder
+from edslam_ti.trajectory import Trajectory
+
+HELD_OUT = {4, 9}
+
+
+def images_of(
+    sequence: EventDepthSequence, samples: list[Sample], **settings: float
+) -> tuple[EventImages, Trajectory]:
+    """Return the images of a run with true poses, solved every five frames and at the end."""
+    assert sequence.contrast_threshold is not None
+    images = EventImages(sequence.camera, sequence.contrast_threshold, MappingConfig(**settings))
+    builder, trajectory = FrameBuilder(sequence.camera, TimeSurfaceConfig()), Trajectory()
+    for k, sample in enumerate(samples):
+        assert sample.T_world_camera is not None
+        trajectory.append(sample.timestamp, sample.T_world_camera)
+        images.append(builder.build(sample, is_held_out=k in HELD_OUT), k)
+        if k % 5 == 4:
+            images.solve(trajectory)
+    images.solve(trajectory, is_thorough=True)
+    return images, trajectory
+
+
+def errors(images: EventImages, samples: list[Sample]) -> np.ndarray:  # [F] log brightness
+    """Return the rms error of every image, after one shift for all."""
+    differences = []
+    for k in images.frames:
+        image = samples[k].image
+        assert image is not None
+        differences.append(images.log_brightness(k) - np.log(image + 1 / 255))
+    shift = np.mean(differences)
+    return np.array([float(np.sqrt(((d - shift) ** 2).mean())) for d in differences])
+
+
+@pytest.mark.parametrize("stretch", [3.0, 0.25])
+def test_images_are_close_to_the_truth_in_one_stretch_or_several(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], stretch: float
+) -> None:
+    images, _ = images_of(tiny_sequence, tiny_samples, stretch=stretch)
+    assert HELD_OUT.isdisjoint(images.frames)
+    spread = np.std([np.log(s.image + 1 / 255) for s in tiny_samples if s.image is not None])
+    assert spread > 0.4
+    assert errors(images, tiny_samples).max() < 0.3  # of which a blurred start is the larger part
+    assert np.median(errors(images, tiny_samples)) < 0.26
+
+
+def test_details_of_the_start_come_from_the_map(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    images, _ = images_of(tiny_sequence, tiny_samples)
+    before = errors(images, tiny_samples)
+    for _ in range(20):
+        for k in images.frames:
+            image = tiny_samples[k].image
+            assert image is not None
+            images.take_over_details(
+                k, (np.log(image + 1 / 255) - images.log_brightness(k)).astype(np.float32)
+            )
+    assert (errors(images, tiny_samples) < before).all()
+
+
+def test_brightest_percent_is_put_to_white(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    images, _ = images_of(tiny_sequence, tiny_samples)
+    before = images.log_brightness(3)
+    shift = images.set_white(0.9)
+    np.testing.assert_allclose(images.log_brightness(3), before + shift, atol=1e-5)
+    assert images.set_white(0.9) == pytest.approx(0, abs=1e-5)
+
+
+def test_number_of_frames_is_bounded_and_keyframes_go_last(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    images, _ = images_of(tiny_sequence, tiny_samples, max_views=10)
+    images.thin_out(keep={1, 3})
+    assert len(images.frames) <= 10
+    assert {1, 3, len(tiny_samples) - 1} <= set(images.frames)
