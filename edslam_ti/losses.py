@@ -6,9 +6,7 @@ from torch import Tensor
 from edslam_ti.camera import Camera
 from edslam_ti.gaussians import Gaussians
 from edslam_ti.geometry import inverse
-from kernels.view_losses import Comparison, compare_change, compare_view
-
-CHANGE_FLOOR = 1e-3  # squared log brightness; an interval without events must not divide by zero
+from kernels.view_losses import Comparison, compare_view
 
 
 def brightness_change(
@@ -28,24 +26,8 @@ def event_loss(
 
     The raw loss grows with motion and interval length; divided, every interval weighs alike.
     """
-    return (predicted - measured).square().mean() / (measured.square().mean() + CHANGE_FLOOR)
-
-
-def change_loss(
-    gaussians: Gaussians,
-    camera: Camera,
-    T_world_camera: Tensor,  # [2, 4, 4] poses at the start and at the end
-    measured: Tensor,  # [H, W] Eq. 11
-    background: float,  # brightness behind everything
-    epsilon: float,
-) -> Comparison:
-    """Return `event_loss` of the brightness change between two views, with all gradients in one pass."""
-    scale = 1 / (measured.numel() * (float(measured.square().mean()) + CHANGE_FLOOR))
-    return compare_change(
-        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors,
-        torch.stack([inverse(pose) for pose in T_world_camera]).float(),
-        camera.intrinsics, (camera.width, camera.height), measured, background, epsilon, scale,
-    )  # fmt: skip
+    floor = 1e-3  # an interval without events must not divide by zero
+    return (predicted - measured).square().mean() / (measured.square().mean() + floor)
 
 
 def view_loss(

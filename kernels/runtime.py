@@ -28,6 +28,9 @@ def _place_in_source(self: ASTTransformerContext, node: ast.expr | ast.stmt) -> 
 # finding the source of functions once for each of their uses.
 ASTTransformerContext.get_pos_info = _place_in_source
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+# At every launch, Taichi asked anew for each array whether torch is there and what its dtype is called.
+kernel_impl.has_pytorch = functools.cache(kernel_impl.has_pytorch)
+kernel_impl.to_taichi_type = functools.cache(kernel_impl.to_taichi_type)
 
 
 def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool | None = None) -> None:
