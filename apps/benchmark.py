@@ -12,7 +12,7 @@ from typing import Literal
 from edslam_ti.command_line import launch, parse_arguments
 from edslam_ti.errors import EdSlamError
 
-Suite = Literal["time_surface", "tracking", "rasterizer", "mapping_step", "slam", "scaling"]
+Suite = Literal["time_surface", "tracking", "rasterizer", "mapping_step", "cold_start", "slam", "scaling"]
 KERNELS: tuple[Suite, ...] = ("time_surface", "tracking", "rasterizer", "mapping_step")
 HEADER = (
     "| task | | wall ms | CPU ms | wall / first | CPU / first | limit ms |\n|---|---|--:|--:|--:|--:|--:|"

@@ -32,6 +32,7 @@ from kernels.benchmark import (
     OURS,
     Row,
     Stopwatch,
+    cold_start,
     rasterize_pairs,
     rasterizer,
     room_scene,
@@ -66,6 +67,8 @@ def rows(
                 yield from rasterizer(size, count, watch, device)
             if "mapping_step" in suites:
                 yield from mapping_step(size, count, watch)
+    if "cold_start" in suites:
+        yield from cold_start(torch.get_num_threads(), rounds=3)
     if "slam" in suites:
         yield from slam(*sequence)
 
@@ -268,7 +271,7 @@ def plot_scaling(path: Path, curves: Sequence[Curve]) -> None:
     from matplotlib import pyplot as plt
 
     kinds = list(dict.fromkeys(curve.against for curve in curves))
-    figure, panels = plt.subplots(1, len(kinds), figsize=(4 * len(kinds), 4), squeeze=False)
+    figure, panels = plt.subplots(1, len(kinds), figsize=(3.5 * len(kinds), 5), squeeze=False)
     for kind, panel in zip(kinds, panels[0]):
         shown = [curve for curve in curves if curve.against == kind]
         for curve in shown:
@@ -279,10 +282,10 @@ def plot_scaling(path: Path, curves: Sequence[Curve]) -> None:
         slope = -1 if kind == "threads" else 1
         panel.loglog(sizes, 0.7 * lowest * (sizes / sizes[0]) ** slope, "k:", label=f"slope {slope}")
         panel.set_xlabel(kind)
-        panel.set_xticks(sizes, [f"{size:.3g}" for size in sizes])
+        panel.set_xticks(sizes, [f"{size:,.0f}" for size in sizes], rotation=20)
         panel.minorticks_off()
         panel.set_ylabel("wall ms" if kind == "threads" else "CPU ms")
-        panel.legend(fontsize=7)
+        panel.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1))
     figure.tight_layout()
     with atomic_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=90)

@@ -7,8 +7,11 @@ the bandwidth and the rate that torch reaches here.
 """
 
 import importlib.util
+import json
 import os
 import platform
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -29,11 +32,13 @@ from kernels.patch_warp import (
     Patches,
     ResidualModel,
     adjoint,
+    compile_kernels,
     extract_patches,
 )
 from kernels.projection import MIN_ALPHA
 from kernels.rasterization import rasterize
-from kernels.time_surface import time_surface, update_last_timestamps
+from kernels.time_surface import MANY_EVENTS, accumulate_polarity, time_surface, update_last_timestamps
+from kernels.view_losses import compare_change, compare_view
 
 OURS = "Taichi"
 TWIN_LIMIT = 3e7  # Gaussians times pixels that the torch twin still manages, all at once
@@ -437,3 +442,51 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
     pixels = 2 * NUM_PATCHES * PATCH_SIZE**2
     work = Work(16 * pixels + surface.nbytes + depth.nbytes, FLOPS_LINEARISE * pixels)
     yield from watch.compare("tracking", task, candidates, work)
+
+
+# --- cold start ---
+
+FRESH_PROCESS = """
+import json, time
+def now():
+    return time.perf_counter(), time.process_time()
+stamps = [now()]
+import kernels.benchmark
+stamps.append(now())
+kernels.init("cpu", threads={threads})
+stamps.append(now())
+kernels.benchmark.run_every_kernel()
+stamps.append(now())
+print(json.dumps(stamps))
+"""
+
+
+def run_every_kernel() -> None:
+    """Run what a run of SLAM runs, on next to nothing: afterwards all of it is compiled."""
+    inputs, intrinsics = room_scene(20, 16, 12)
+    tensors = [x.requires_grad_() for x in inputs]
+    view = rasterize(*tensors, intrinsics, (16, 12))
+    (view.image.sum() + view.depth.sum()).backward()
+    target, poses = torch.zeros(12, 16), torch.stack([inputs[-1]] * 2)
+    scene = [x.detach() for x in inputs[:-1]]
+    compare_change(*scene, poses, intrinsics, (16, 12), target, 0.5, 0.01, 1.0)
+    compare_view(*scene, poses[0], intrinsics, (16, 12), target, target, 0.5, 0.01, 1.0, 1.0)
+    compile_kernels()
+    x, t = np.zeros(MANY_EVENTS, np.int16), np.zeros(MANY_EVENTS)
+    update_last_timestamps(x, x, t, np.zeros((1, 1)))
+    accumulate_polarity(x[:1], x[:1], np.ones(1, np.int8), np.array([0, 1]), (1, 1))
+
+
+def cold_start(threads: int, rounds: int) -> Iterator[Row]:
+    """Yield what the parts of a start cost in a fresh process, Taichi's cache of compiled kernels warm."""
+    code = FRESH_PROCESS.format(threads=threads)
+    samples = []
+    for _ in range(rounds):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        samples.append(np.diff(json.loads(done.stdout.splitlines()[-1]), axis=0))
+    parts = 1e3 * np.median(samples, axis=0)  # of three or more, as the first may have filled the cache
+    names = ("import", "start Taichi", "compile every kernel")
+    total = parts.sum(0)
+    for name, (wall, cpu) in zip(("all", *names), [total, *parts]):
+        ratios = float(wall / total[0]), float(cpu / total[1])
+        yield Row("cold_start", "cold start", name, float(wall), float(cpu), *ratios, None)

@@ -17,6 +17,7 @@ from edslam_ti.gaussians import GaussianMap
 from kernels.benchmark import (
     Row,
     Stopwatch,
+    cold_start,
     count_pairs,
     linearise_in_numpy,
     linearise_in_torch,
@@ -136,6 +137,13 @@ def test_frames_of_a_sequence_pass_through_every_method(
     assert names[:2] == ["ed_slam, tracking", "ed_slam with time surfaces, tracking"]
     assert rows[-1].name == "ed_slam, tracking and mapping"
     assert rows[-1].cpu_ms > rows[0].cpu_ms
+
+
+def test_cold_start_is_the_sum_of_its_parts() -> None:
+    total, *parts = cold_start(threads=2, rounds=1)
+    assert [row.name for row in parts] == ["import", "start Taichi", "compile every kernel"]
+    assert total.cpu_ms == pytest.approx(sum(row.cpu_ms for row in parts))
+    assert all(row.cpu_ms > 1 for row in parts)
 
 
 def test_missing_device_is_one_line() -> None:
