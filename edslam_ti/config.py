@@ -172,7 +172,7 @@ class Config(Stage):
     poses: Literal["tracked", "truth"] = "tracked"
     """truth: skip tracking and map with the true poses."""
     contrast_threshold: float | None = Field(None, gt=0)
-    """C in Eq. 11; omitted: the data set's own (camera.json), else 0.1 synthetic, 0.2 real (Sec. IV-A)."""
+    """C in Eq. 11; omitted: the data set's own (camera.json), else estimated from its images, else 0.1."""
     max_interval: float = Field(0.1, gt=0)
     """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
     out: Path = Path("results")

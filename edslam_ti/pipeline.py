@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 import kernels
 from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
+from edslam_ti.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
 from edslam_ti.evaluation import ate_rmse_cm
@@ -24,7 +25,6 @@ from edslam_ti.slam import Slam
 from edslam_ti.tracking import Tracker, TruePoses
 from edslam_ti.visualization import StubViewer, Viewer
 
-DEFAULT_CONTRAST_THRESHOLD = 0.1  # C for data that states none (Sec. IV-A: 0.1 synthetic, 0.2 real)
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 
 
@@ -68,15 +68,21 @@ def run(config: Config, console: Console | None = None) -> Path:
 def _prepare(config: Config) -> Run:
     sequence = open_sequence(config)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
-    slam = make_slam(config, sequence, samples)
-    return Run(config, sequence, samples, slam, held_out_frames(samples, config.evaluation.hold_out_every))
+    return Run(
+        config,
+        sequence,
+        samples,
+        make_slam(config, sequence, samples),
+        held_out_frames(samples, config.evaluation.hold_out_every),
+        contrast_of(config, sequence, samples),
+    )
 
 
 def make_slam(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> Slam:
     """Return the method that the settings name, ready to start at the first sample's true pose."""
-    contrast = config.contrast_threshold or sequence.contrast_threshold or DEFAULT_CONTRAST_THRESHOLD
+    contrast = contrast_of(config, sequence, samples)
     tracker: Tracker
-    tracker, mapper = METHODS[config.method].build(sequence, contrast, config)
+    tracker, mapper = METHODS[config.method].build(sequence, contrast.value, config)
     if config.poses == "truth":
         if sequence.truth is None:
             raise DataError(f"{sequence.scene}: --poses truth needs true poses, and this sequence has none")
@@ -88,6 +94,12 @@ def make_slam(config: Config, sequence: EventDepthSequence, samples: SampledSequ
         mapper if config.mapping.enabled else None,
         initial_pose=np.eye(4) if truth is None else truth,
     )
+
+
+def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> ContrastThreshold:
+    """Return the contrast threshold of a run, with its source."""
+    first, last = (float(t) for t in samples.timestamps[[0, -1]])
+    return contrast_threshold(config.contrast_threshold, sequence, first, last)
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

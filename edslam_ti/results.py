@@ -18,6 +18,7 @@ from rich.console import Console
 
 from edslam_ti import __version__
 from edslam_ti.config import Config
+from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation import (
@@ -66,6 +67,7 @@ class Run:
     samples: SampledSequence
     slam: Slam
     held_out: set[int]  # sample indices kept from mapping
+    contrast: ContrastThreshold
     num_events: int = 0
     finish_seconds: float = 0.0
     is_interrupted: bool = False
@@ -194,6 +196,11 @@ def _metrics(state: Run, of_map: dict[str, Any]) -> dict[str, Any]:
         "num_keyframes": len(mapper.keyframes) if isinstance(mapper, GaussianMapper) else None,
         "num_gaussians": mapper.num_gaussians if mapper is not None else 0,
         "num_events": state.num_events,
+        "contrast_threshold": _rounded(state.contrast.value),
+        "contrast_threshold_source": state.contrast.source,
+        "contrast_threshold_positive": _rounded(state.contrast.positive),
+        "contrast_threshold_negative": _rounded(state.contrast.negative),
+        "contrast_threshold_deviation": _rounded(state.contrast.deviation),
         "tracking_hz": _rounded(frames / (slam.frame_seconds + slam.tracking_seconds)),
         "tracking_s": _rounded(slam.frame_seconds + slam.tracking_seconds),
         "mapping_s": _rounded(slam.mapping_seconds),

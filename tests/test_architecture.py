@@ -23,7 +23,13 @@ RANKS: list[list[str]] = [
         "edslam_ti.brightness_image",
     ],
     [
-        *("edslam_ti.frame", "edslam_ti.tracking", "edslam_ti.keyframes", "edslam_ti.event_images"),
+        *(
+            "edslam_ti.contrast",
+            "edslam_ti.frame",
+            "edslam_ti.tracking",
+            "edslam_ti.keyframes",
+            "edslam_ti.event_images",
+        ),
         *("edslam_ti.brightness_tracking", "edslam_ti.mapping"),
     ],
     ["edslam_ti.slam"],
