@@ -15,16 +15,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 
 from edslam_ti.camera import Camera
 from edslam_ti.events import Events
+from kernels.brightness_image import solve_brightness_image
 from kernels.time_surface import add_polarity
 
 HYSTERESIS = 0.5  # thresholds
 HUBER = 0.1  # log brightness; equations beyond count less (occlusions, reflections, wrong depth)
-OCCLUSION = 0.03  # a point this share of its depth behind what is measured is hidden
 
 
 class BrightnessChange:
@@ -73,61 +71,16 @@ def solve_log_brightness_image(
     reweightings: int = 1,
 ) -> np.ndarray:  # [h, w] float32
     """Return the keyframe's log brightness by conjugate gradients, robustly reweighted."""
-    systems = [_equations(depth, camera, o) for o in observations]
-    A = sparse.vstack([a for a, _ in systems]).tocsr()
-    A_t = A.T.tocsr()
-    b = np.concatenate([c for _, c in systems])
-    start = prior.ravel().astype(np.float32)
-    level, weight = start, np.ones(len(b), np.float32)
-    squares = A_t.multiply(A_t).tocsr()
-    for k in range(reweightings + 1):
-        if k:
-            weight = np.minimum(1, HUBER / np.maximum(np.abs(A @ level - b), 1e-6)).astype(np.float32)
-        inverse_diagonal = 1 / (squares @ weight + prior_weight)
-        normal = _operator(A, A_t, weight, prior_weight)
-        right_side = A_t @ (weight * b) + prior_weight * start
-        jacobi = LinearOperator(normal.shape, matvec=lambda x, d=inverse_diagonal: d * x, dtype=np.float32)
-        level, _ = cg(normal, right_side, x0=level, rtol=1e-4, maxiter=iterations, M=jacobi)
-    return level.reshape(prior.shape).astype(np.float32)
-
-
-def _operator(
-    A: sparse.csr_matrix, A_t: sparse.csr_matrix, weight: np.ndarray, prior_weight: float
-) -> LinearOperator:
-    n = A.shape[1]
-    return LinearOperator(
-        (n, n), matvec=lambda x: A_t @ (weight * (A @ x)) + prior_weight * x, dtype=np.float32
+    missing = np.zeros_like(depth)
+    return solve_brightness_image(
+        depth,
+        camera.intrinsics,
+        np.reshape([o.T_camera_keyframe for o in observations], (-1, 4, 4)),
+        np.reshape([o.change for o in observations], (-1, *depth.shape)),
+        np.reshape([missing if o.depth is None else o.depth for o in observations], (-1, *depth.shape)),
+        prior,
+        prior_weight,
+        HUBER,
+        iterations,
+        reweightings,
     )
-
-
-def _equations(
-    depth: np.ndarray, camera: Camera, observation: Observation
-) -> tuple[sparse.csr_matrix, np.ndarray]:  # [m, h w], [m]
-    """Return the rows l(u) - l(x(u)) = E(x(u)) of every pixel u seen at that time."""
-    height, width = depth.shape
-    v, u = np.nonzero(depth > 0)
-    z = depth[v, u]
-    rays = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
-    T = observation.T_camera_keyframe.astype(np.float32)
-    p = T[:3, :3] @ rays.astype(np.float32) + T[:3, 3:]
-    x = camera.fx * p[0] / np.maximum(p[2], 1e-3) + camera.cx
-    y = camera.fy * p[1] / np.maximum(p[2], 1e-3) + camera.cy
-    seen = (p[2] > 0.05) & (x >= 0) & (x < width - 1.001) & (y >= 0) & (y < height - 1.001)
-    own = (v * width + u)[seen]
-    x, y, z = x[seen], y[seen], p[2][seen]
-    column, row = x.astype(np.int32), y.astype(np.int32)
-    fx, fy = x - column, y - row
-    corner = row * width + column
-    corners = np.stack([corner, corner + 1, corner + width, corner + width + 1], 1)  # [m, 4]
-    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1).astype(np.float32)
-    if observation.depth is not None:
-        measured = observation.depth.ravel()[corners]
-        nearest = np.where(measured > 0, measured, np.inf).min(1)
-        visible = z <= nearest * (1 + OCCLUSION) + 0.02
-        own, corners, weights = own[visible], corners[visible], weights[visible]
-    m = len(own)
-    change = (weights * observation.change.ravel()[corners]).sum(1)
-    values = np.concatenate([np.ones((m, 1), np.float32), -weights], 1).ravel()
-    columns = np.concatenate([own[:, None], corners], 1).ravel()
-    rows = sparse.csr_matrix((values, columns, 5 * np.arange(m + 1)), (m, height * width))
-    return rows, change.astype(np.float32)

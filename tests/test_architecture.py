@@ -60,7 +60,7 @@ LIBRARIES: dict[str, list[str]] = {
     "yaml": ["edslam_ti.config"],
     "scipy": [
         *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.brightness"),
-        *("edslam_ti.pointcloud", "edslam_ti.pictures", "edslam_ti.brightness_image"),
+        *("edslam_ti.pointcloud", "edslam_ti.pictures"),
     ],
     "cv2": [
         *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.pictures"),
