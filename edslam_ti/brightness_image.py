@@ -18,8 +18,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.events import Events
-from kernels.brightness_image import solve_brightness_image
-from kernels.time_surface import add_polarity
+from kernels import brightness_image, time_surface
 
 HYSTERESIS = 0.5  # thresholds
 HUBER = 0.1  # log brightness; equations beyond count less (occlusions, reflections, wrong depth)
@@ -39,7 +38,7 @@ class BrightnessChange:
 
     def add(self, events: Events) -> None:
         """Add events that follow those added before."""
-        add_polarity(events.x, events.y, events.polarity, self._sum, self._last)
+        time_surface.add_polarity(events.x, events.y, events.polarity, self._sum, self._last)
 
     def log_brightness(self, contrast_threshold: float) -> np.ndarray:  # [H, W] float32
         """Return the change since the beginning."""
@@ -72,7 +71,7 @@ def solve_log_brightness_image(
 ) -> np.ndarray:  # [h, w] float32
     """Return the keyframe's log brightness by conjugate gradients, robustly reweighted."""
     missing = np.zeros_like(depth)
-    return solve_brightness_image(
+    return brightness_image.solve_brightness_image(
         depth,
         camera.intrinsics,
         np.reshape([o.T_camera_keyframe for o in observations], (-1, 4, 4)),
@@ -84,3 +83,9 @@ def solve_log_brightness_image(
         iterations,
         reweightings,
     )
+
+
+def compile_kernels() -> None:
+    """Compile what images need, so that the first frames of a sequence need not wait for it."""
+    brightness_image.compile_kernels()
+    time_surface.compile_kernels()

@@ -13,7 +13,12 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from edslam_ti.brightness_image import BrightnessChange, Observation, solve_log_brightness_image
+from edslam_ti.brightness_image import (
+    BrightnessChange,
+    Observation,
+    compile_kernels,
+    solve_log_brightness_image,
+)
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame, downscaled, downscaled_depth
@@ -121,6 +126,7 @@ class BrightnessTracker:
         self._usual_events = 0.0
         self._num_misfits = 0
         self._path = _Path(Trajectory())
+        compile_kernels()
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame`; earlier poses on the trajectory may be corrected."""

@@ -102,7 +102,7 @@ def folded(image: ti.template(), p, width):
 @ti.func
 def unfold(values: ti.template(), width, image: ti.template()):
     """Four-vectors of the values at each pixel's corners."""
-    for p in range(values.shape[0] - width - 1):
+    for p in range(image.shape[0] - width - 1):
         image[p] = ti.Vector([values[p], values[p + 1], values[p + width], values[p + width + 1]])
 
 
@@ -256,3 +256,11 @@ def solve_brightness_image(
         around, sums, squares, *(a for pair in views for a in pair),
     )  # fmt: skip
     return level.numpy()[:n].reshape(height, width)
+
+
+def compile_kernels() -> None:
+    """Compile what a solution needs, so that the first frames of a sequence need not wait for it."""
+    image = np.ones((3, 3), np.float32)
+    solve_brightness_image(
+        image, (1.0, 1.0, 0.0, 0.0), np.eye(4)[None], image[None], image[None], image, 1.0, 1.0, 1, 0
+    )

@@ -155,6 +155,12 @@ def add_polarity(
         _add_polarity(x, y, polarity, total, last)
 
 
+def compile_kernels() -> None:
+    """Compile what a running sum needs, so that the first frame of a sequence need not wait for it."""
+    place, one = np.zeros(1, np.int16), np.ones(1, np.int8)
+    add_polarity(place, place, one, np.zeros((1, 1), np.int32), np.zeros((1, 1), np.int8))
+
+
 def _check_inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> None:
     """Kernels do not check bounds, so this does."""
     height, width = shape

@@ -10,7 +10,7 @@ from edslam_ti.brightness_image import HUBER, Observation, solve_log_brightness_
 from edslam_ti.camera import Camera
 from edslam_ti.geometry import exp_matrix
 
-CAMERA = Camera(40, 30, 36.0, 36.0, 19.5, 14.5)
+CAMERA = Camera(41, 30, 36.0, 36.0, 20.0, 14.5)  # 41 x 30 pixels are no multiple of the lanes
 PRIOR_WEIGHT = 1e-2
 RANDOM = np.random.default_rng(0)
 
