@@ -35,6 +35,9 @@ from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, R
 
 IMAGE_WIDTH = 192  # pixels, roughly
 WINDOW = 12  # frames a keyframe's image is solved from
+OBSERVATIONS = 6  # of them that its equations are taken from
+COARSE_STEPS, FINAL_STEPS = 12, 3  # Levenberg-Marquardt steps a level, and with all depth pixels
+AGREEMENT = 4  # standard deviations by which averaged depths may differ
 MIN_FRAMES = 5  # before the first image is solved
 MIN_FLOW = 1.5  # pixels of brightness images that the scene must have moved before the first image is solved
 STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
@@ -45,11 +48,20 @@ MAX_MISFIT = 0.25  # log brightness, median: beyond, the image is not that of th
 MAX_MISFITS = 4  # such frames in a row after which the image is given up
 REVISIT_OVERLAP = 0.6  # share of an old keyframe's pixels that must be in view again
 REVISIT_MISFIT = 0.12  # log brightness, median
-REVISIT_DISTANCE, REVISIT_ANGLE = 0.3, 15.0  # metres, degrees: larger corrections are not believed
-COAST_DISTANCE, COAST_ANGLE = 0.02, 2.0  # metres, degrees: depth alone has done no better than a guess
+NO_DRIFT = (0.003, 0.2)  # metres, degrees: smaller corrections are the alignment's own error
+MAX_DRIFT = (0.3, 15.0)  # metres, degrees: larger ones are not believed
+COASTED = (0.02, 2.0)  # metres, degrees: depth alone has done no better than a guess
 MAX_REVISITS = 3  # old keyframes compared with a new one
 MAX_RECOGNISED = 20  # old keyframes searched after a gap
 MIN_MATCHES = 15  # features that must agree for a keyframe to be recognised
+
+
+@dataclass(frozen=True)
+class _Depth:
+    """A depth image, as measured and at the size of brightness images; metres, 0 = missing."""
+
+    full: np.ndarray  # [H, W]
+    small: np.ndarray  # [h, w]
 
 
 @dataclass(frozen=True)
@@ -58,7 +70,7 @@ class _Moment:
 
     index: int  # of the frame in the trajectory
     change: np.ndarray  # [h, w] log brightness since the stretch of events began
-    depth: np.ndarray | None  # [h, w] metres, 0 = missing
+    depth: _Depth | None
 
 
 @dataclass
@@ -68,9 +80,11 @@ class _Keyframe:
     index: int  # of the frame in the trajectory
     stretch: int  # of uninterrupted events
     change: np.ndarray  # [h, w] as in `_Moment`
-    depth: np.ndarray  # [h, w] metres, 0 = missing
+    measured: _Depth  # at its time
+    depth: _Depth  # averaged with that of neighbouring frames
     log_brightness: np.ndarray  # [h, w]
     points: list[Tensor]  # pixels to align, at full and at half size; see `Patches.points`
+    depth_points: Tensor | None  # pixels of the full depth image to align
     next_solution: int  # index of the frame at which the image is solved for again
     is_compared: bool = False  # with older keyframes
 
@@ -103,6 +117,7 @@ class BrightnessTracker:
         self._config = config
         # Images are halved until they are about 192 pixels wide: the noise of events averages out.
         self._level = max(0, round(math.log2(camera.width / IMAGE_WIDTH)))
+        self._camera, self._rays = camera, camera.rays().astype(np.float32)
         self._cameras = [camera.downscaled(2 ** (self._level + k)) for k in range(2)]
         self._contrast_threshold = contrast_threshold
         self._random = np.random.default_rng(seed + 1)
@@ -116,6 +131,7 @@ class BrightnessTracker:
             depth_sigma_2=config.depth_sigma_2,
             huber_threshold=config.huber_threshold,
         )
+        self._brightness_only = replace(self._model, depth_weight=0.0)
         self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
         self._change = BrightnessChange(camera.shape)
         self._stretch, self._stretch_start = 0, 0  # number and first frame of the stretch of events
@@ -159,7 +175,8 @@ class BrightnessTracker:
         change = self._change.log_brightness(self._contrast_threshold)
         for _ in range(self._level):
             change = downscaled(change)
-        moment = _Moment(index, change, None if frame.depth is None else frame.level(self._level).depth)
+        depth = None if frame.depth is None else _Depth(frame.depth, frame.level(self._level).depth)
+        moment = _Moment(index, change, depth)
         self._moments = [*self._moments, moment][-WINDOW:]
         return moment
 
@@ -172,7 +189,7 @@ class BrightnessTracker:
         if self._keyframe is None:
             self._begin_stretch(len(self._path.trajectory))
             return ""
-        flow = self._flow(self._keyframe.depth, self._path.pose(len(self._path.trajectory) - 1), guess)
+        flow = self._flow(self._keyframe.depth.small, self._path.pose(len(self._path.trajectory) - 1), guess)
         if flow < SILENT_FLOW:
             return ""  # the camera has stopped: its image stays as it is
         self._give_up_image()
@@ -193,13 +210,14 @@ class BrightnessTracker:
 
     def _coast(self, moment: _Moment, guess: np.ndarray) -> TrackingResult:
         """Align depth alone to the last keyframe's."""
-        depth = moment.depth
-        if depth is None or not depth.any():
+        if moment.depth is None or not moment.depth.small.any():
             return TrackingResult(guess, False, 0.0, "too few events, and no depth to align instead")
-        old, T = self._old_keyframes[-1], guess
+        old, T, depth = self._old_keyframes[-1], guess, moment.depth.small
         for level, image in ((1, downscaled_depth(depth)), (0, depth)):
-            linearise = self._linearised(old, self._depth_only, [np.zeros_like(image), image], level)
-            T, system = levenberg_marquardt(linearise, T, self._config.iterations)
+            linearise = self._linearised(
+                old, old.points[level], self._depth_only, [np.zeros_like(image), image], self._cameras[level]
+            )
+            T, system = levenberg_marquardt(linearise, T, COARSE_STEPS)
         if system.num_depth < MIN_PIXELS:
             return TrackingResult(guess, False, 0.0, "too few events, and depth does not overlap")
         return TrackingResult(orthonormalized(T), True, 0.5 * system.num_depth / system.num_usable)
@@ -214,9 +232,9 @@ class BrightnessTracker:
         middle = self._moments[len(self._moments) // 2].index
         moment = min(with_depth, key=lambda m: abs(m.index - middle))
         assert moment.depth is not None
-        if self._flow(moment.depth, self._path.pose(moment.index), self._path.newest) < MIN_FLOW:
+        if self._flow(moment.depth.small, self._path.pose(moment.index), self._path.newest) < MIN_FLOW:
             return False
-        self._keyframe = self._new_keyframe(moment, np.zeros_like(moment.depth))
+        self._keyframe = self._new_keyframe(moment, np.zeros_like(moment.depth.small))
         self._solve(reweightings=0, iterations=40)
         for _ in range(2):  # image and poses in turn
             self._solve()
@@ -227,8 +245,8 @@ class BrightnessTracker:
     def _new_keyframe(self, moment: _Moment, log_brightness: np.ndarray) -> _Keyframe:
         assert moment.depth is not None
         return _Keyframe(
-            moment.index, self._stretch, moment.change, moment.depth, log_brightness,
-            points=[], next_solution=self._moments[-1].index + MIN_SOLVE_FRAMES,
+            moment.index, self._stretch, moment.change, moment.depth, moment.depth, log_brightness,
+            points=[], depth_points=None, next_solution=self._moments[-1].index + MIN_SOLVE_FRAMES,
         )  # fmt: skip
 
     def _flow(self, depth: np.ndarray, T_world_a: np.ndarray, T_world_b: np.ndarray) -> float:
@@ -308,25 +326,63 @@ class BrightnessTracker:
         """Solve for the keyframe's image from the last frames, and choose its pixels to align."""
         keyframe = self._keyframe
         assert keyframe is not None
+        keyframe.depth = self._fused_depth(keyframe)
         T_world_keyframe = self._path.pose(keyframe.index)
         observations = [
             Observation(
                 rigid_inverse(self._path.pose(m.index)) @ T_world_keyframe,
                 m.change - keyframe.change,
-                m.depth,
+                None if m.depth is None else m.depth.small,
             )
-            for m in self._moments
-            if m.index != keyframe.index
+            for m in self._spread(keyframe)
         ]
         image = solve_log_brightness_image(
-            keyframe.depth, self._cameras[0], observations, keyframe.log_brightness,
+            keyframe.depth.small, self._cameras[0], observations, keyframe.log_brightness,
             iterations=iterations, reweightings=reweightings,
         )  # fmt: skip
         keyframe.log_brightness = image
         keyframe.points = [
-            self._chosen(image, keyframe.depth, 0),
-            self._chosen(downscaled(image), downscaled_depth(keyframe.depth), 1),
+            self._chosen(image, keyframe.depth.small, 0),
+            self._chosen(downscaled(image), downscaled_depth(keyframe.depth.small), 1),
         ]
+        keyframe.depth_points = self._depth_points(keyframe.depth.full)
+
+    def _fused_depth(self, keyframe: _Keyframe) -> _Depth:
+        """Return the keyframe's depth averaged with that of recent frames where they agree."""
+        own = keyframe.measured.full
+        fx, fy, cx, cy = self._camera.intrinsics
+        gate = AGREEMENT * (self._model.depth_sigma + self._model.depth_sigma_2 * own**2)
+        total, count = own.copy(), np.ones_like(own)
+        T_world_keyframe = self._path.pose(keyframe.index)
+        for moment in self._spread(keyframe):
+            if moment.depth is None:
+                continue
+            T = (rigid_inverse(self._path.pose(moment.index)) @ T_world_keyframe).astype(np.float32)
+            direction = self._rays @ T[:3, :3].T
+            p = direction * own[..., None] + T[:3, 3]
+            z = np.maximum(p[..., 2], 0.05)
+            x, y = fx * p[..., 0] / z + cx, fy * p[..., 1] / z + cy
+            further = (cv2.remap(moment.depth.full, x, y, cv2.INTER_LINEAR) - z) / direction[..., 2]
+            agrees = np.abs(further) < gate
+            total += np.where(agrees, own + further, 0)
+            count += agrees
+        full = np.where(own > 0, total / count, 0).astype(np.float32)
+        small = full
+        for _ in range(self._level):
+            small = downscaled_depth(small)
+        return _Depth(full, small)
+
+    def _depth_points(self, depth: np.ndarray) -> Tensor:  # [blocks, 4, LANES]
+        """Return all pixels of a depth image: noise averages out over them."""
+        v, u = np.nonzero(depth)
+        pixels = np.stack([u, v, 1 / depth[v, u]], -1).astype(np.float32)
+        return Patches(pixels, np.zeros(len(v), np.float32)).points(self._camera.intrinsics)
+
+    def _spread(self, keyframe: _Keyframe) -> list[_Moment]:
+        """Return recent frames, spread in time, that the keyframe's image is solved from."""
+        others = [m for m in self._moments if m.index != keyframe.index]
+        count = min(len(others), OBSERVATIONS)
+        return [others[round(k)] for k in np.linspace(0, len(others) - 1, count)]
 
     def _chosen(self, image: np.ndarray, depth: np.ndarray, level: int) -> Tensor:  # [blocks, 4, LANES]
         """Return random pixels with depth, those with a strong gradient first."""
@@ -343,16 +399,30 @@ class BrightnessTracker:
         self,
         keyframe: _Keyframe,
         image: np.ndarray,  # [h, w] log brightness
-        depth: np.ndarray | None,  # [h, w] metres, 0 = missing
+        depth: _Depth | None,
         start: np.ndarray,  # [4, 4] T_world_camera
     ) -> _Aligned:
         """Align an image, and its depth where there is any, to a keyframe, coarse to fine."""
-        if depth is None:
-            depth = np.zeros_like(image)
+        small = np.zeros_like(image) if depth is None else depth.small
         T = start
-        for level, view in ((1, [downscaled(image), downscaled_depth(depth)]), (0, [image, depth])):
-            linearise = self._linearised(keyframe, self._model, view, level)
-            T, system = levenberg_marquardt(linearise, T, self._config.iterations)
+        for level, view in ((1, [downscaled(image), downscaled_depth(small)]), (0, [image, small])):
+            linearise = self._linearised(
+                keyframe, keyframe.points[level], self._model, view, self._cameras[level]
+            )
+            T, system = levenberg_marquardt(linearise, T, COARSE_STEPS)
+        if depth is not None and keyframe.depth_points is not None and self._model.depth_weight > 0:
+            # Reduced depth is blurred at edges: the last steps use it as it was measured.
+            brightness = self._linearised(
+                keyframe, keyframe.points[0], self._brightness_only, [image, small], self._cameras[0]
+            )
+            geometry = self._linearised(
+                keyframe,
+                keyframe.depth_points,
+                self._depth_only,
+                [np.zeros_like(depth.full), depth.full],
+                self._camera,
+            )
+            T, _ = levenberg_marquardt(lambda T: brightness(T) + geometry(T), T, FINAL_STEPS)
         T = orthonormalized(T)
         difference = self._difference(keyframe, image, T)
         misfit = float(np.median(np.abs(difference))) if len(difference) else np.inf
@@ -361,16 +431,13 @@ class BrightnessTracker:
     def _linearised(
         self,
         keyframe: _Keyframe,
+        points: Tensor,
         model: ResidualModel,
-        view: list[np.ndarray],  # log brightness and depth at that size
-        level: int,
+        view: list[np.ndarray],  # log brightness and depth
+        camera: Camera,  # of the view
     ) -> Callable[[np.ndarray], NormalEquations]:
         """Return the normal equations of alignment to a keyframe as a function of T_world_camera."""
-        alignment = Alignment(
-            [Direction(keyframe.points[level], 0, model)],
-            cv2.merge(view)[None],
-            self._cameras[level].intrinsics,
-        )
+        alignment = Alignment([Direction(points, 0, model)], cv2.merge(view)[None], camera.intrinsics)
         T_world_keyframe = self._path.pose(keyframe.index)
 
         def linearise(T_world_camera: np.ndarray) -> NormalEquations:
@@ -383,7 +450,7 @@ class BrightnessTracker:
     def _difference(self, keyframe: _Keyframe, image: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
         """Return an image less a keyframe's, at pixels of the keyframe in view (nearest neighbours)."""
         T = rigid_inverse(T_world_camera) @ self._path.pose(keyframe.index)
-        x, y, _, u, v = self._warped(keyframe.depth, T)
+        x, y, _, u, v = self._warped(keyframe.depth.small, T)
         column, row = np.rint(x).astype(int), np.rint(y).astype(int)
         height, width = image.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -412,7 +479,12 @@ class BrightnessTracker:
         in_view = [k for k in old_enough if self._share_in_view(k, T_now) >= REVISIT_OVERLAP]
         for old in in_view[:MAX_REVISITS]:  # the oldest has drifted least
             T = self._compared(old, keyframe, T_now)
-            if T is not None and _is_near(rigid_inverse(T_now) @ T, REVISIT_DISTANCE, REVISIT_ANGLE):
+            if T is None:
+                continue
+            drift = rigid_inverse(T_now) @ T
+            if _is_near(drift, *NO_DRIFT):
+                return ""
+            if _is_near(drift, *MAX_DRIFT):
                 self._correct(T, old.index, keyframe.index)
                 return f"place of frame {old.index} seen again"
         return ""
@@ -433,9 +505,11 @@ class BrightnessTracker:
 
     def _share_in_view(self, old: _Keyframe, T_world_camera: np.ndarray) -> float:
         camera = self._cameras[0]
-        x, y, _, _, _ = self._warped(old.depth, rigid_inverse(T_world_camera) @ self._path.pose(old.index))
+        x, y, _, _, _ = self._warped(
+            old.depth.small, rigid_inverse(T_world_camera) @ self._path.pose(old.index)
+        )
         inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        return float(inside.sum() / max(np.count_nonzero(old.depth[::2, ::2]), 1))
+        return float(inside.sum() / max(np.count_nonzero(old.depth.small[::2, ::2]), 1))
 
     def _compared(self, old: _Keyframe, new: _Keyframe, start: np.ndarray) -> np.ndarray | None:
         """Return the new keyframe's pose by alignment to an older one, or None where they do not match."""
@@ -462,7 +536,7 @@ class BrightnessTracker:
         at_old = np.array([old_points[m.queryIdx].pt for m in matches]).reshape(-1, 2)
         at_new = np.array([new_points[m.trainIdx].pt for m in matches]).reshape(-1, 2)
         u, v = np.rint(at_old).astype(int).T
-        z = old.depth[v, u].astype(float)
+        z = old.depth.small[v, u].astype(float)
         known = z > 0
         if known.sum() < MIN_MATCHES:
             return None
@@ -499,7 +573,7 @@ class BrightnessTracker:
         correction = T_world_camera @ rigid_inverse(self._path.pose(keyframe.index))
         for index in range(last, len(self._path)):
             self._path.replace(index, correction @ self._path.pose(index))
-        if _is_near(correction, COAST_DISTANCE, COAST_ANGLE) or first < 1:
+        if _is_near(correction, *COASTED) or first < 1:
             twist = log_vector(correction)
             for index in range(first + 1, last):
                 share = (index - first) / (last - first)

@@ -42,7 +42,7 @@ class TrackingConfig(Stage):
     """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
     brightness: bool = True
     """Align to log-brightness images made of events once there are some; False: time surfaces only."""
-    brightness_sigma: float = Field(0.08, gt=0)
+    brightness_sigma: float = Field(0.15, gt=0)
     """Standard deviation of a log-brightness residual."""
     references: Literal["previous", "keyframe", "both"] = "keyframe"
     """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
@@ -173,7 +173,7 @@ class Config(Stage):
     """truth: skip tracking and map with the true poses."""
     contrast_threshold: float | None = Field(None, gt=0)
     """C in Eq. 11; omitted: the data set's own (camera.json), else estimated from its images, else 0.1."""
-    max_interval: float = Field(0.1, gt=0)
+    max_interval: float = Field(0.05, gt=0)
     """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
     out: Path = Path("results")
     """Folder that receives the results."""
