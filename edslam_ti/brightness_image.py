@@ -70,13 +70,12 @@ def solve_log_brightness_image(
     reweightings: int = 1,
 ) -> np.ndarray:  # [h, w] float32
     """Return the keyframe's log brightness by conjugate gradients, robustly reweighted."""
-    missing = np.zeros_like(depth)
     return brightness_image.solve_brightness_image(
         depth,
         camera.intrinsics,
-        np.reshape([o.T_camera_keyframe for o in observations], (-1, 4, 4)),
-        np.reshape([o.change for o in observations], (-1, *depth.shape)),
-        np.reshape([missing if o.depth is None else o.depth for o in observations], (-1, *depth.shape)),
+        [o.T_camera_keyframe for o in observations],
+        [o.change for o in observations],
+        [o.depth for o in observations],
         prior,
         prior_weight,
         HUBER,

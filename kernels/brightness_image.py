@@ -11,6 +11,9 @@ written as one vector, from and to an image of four-vectors. One worker takes th
 sums are the same for any number of workers; waking a second one twice an iteration costs more than it saves.
 """
 
+import functools
+from collections.abc import Sequence
+
 import numpy as np
 import taichi as ti
 import torch
@@ -21,9 +24,11 @@ from kernels.runtime import CHUNK, check_shape, float_dtype, workers
 NEAR = 0.05  # metres
 OCCLUSION, OCCLUSION_MARGIN = 0.03, 0.02  # share of depth, metres: this far behind what is measured is hidden
 BORDER = 1.001  # pixels; all four corners are in the image
-CONVERGED = 1e-10  # of the squared residual, preconditioned, at the start
+CONVERGED = 1e-14  # of the squared residual, preconditioned, at the start
 
-_Corners = ti.types.vector(4)  # values at (x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)
+_Corners = ti.types.vector(
+    4
+)  # at (x - 1, y - 1), (x, y - 1), (x - 1, y), (x, y): named by (x, y), right below
 
 
 def corners(ndim: int) -> ti.types.ndarray:
@@ -34,51 +39,52 @@ def corners(ndim: int) -> ti.types.ndarray:
 @ti.kernel
 def _find_rows(
     # inputs
-    depth: ti.types.ndarray(ndim=2),  # [H, W] metres, 0 = missing
-    poses: ti.types.ndarray(ndim=2),  # [K, 12] rows of T_camera_keyframe
-    changes: ti.types.ndarray(ndim=3),  # [K, H, W]
-    depths: ti.types.ndarray(ndim=3),  # [K, H, W] metres, 0 = missing
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    depth: ti.types.ndarray(ndim=1),  # [H W] metres, 0 = missing
+    projections: ti.types.ndarray(ndim=2),  # [K, 12] rows of [C R C^-1 | C t], C the camera matrix
+    changes: ti.types.ndarray(ndim=1),  # [K H W]
+    depths: ti.types.ndarray(ndim=1),  # [K H W] metres, 0 = missing
+    height: ti.i32,
+    width: ti.i32,
     num_workers: ti.i32,
-    # outputs
+    # outputs, an observation's rows from k H W on
     count: ti.types.ndarray(ti.i32, ndim=1),  # [K] rows of an observation
-    own: ti.types.ndarray(ti.i32, ndim=1),  # [K H W] pixel u
-    corner: ti.types.ndarray(ti.i32, ndim=1),  # [K H W] the pixel above and left of x_k(u)
+    place: ti.types.ndarray(ti.i64, ndim=1),  # [K H W] pixel u + 2^32 times the one right below x_k(u)
     bilinear: ti.types.ndarray(ndim=2),  # [K H W, 4]
     change: ti.types.ndarray(ndim=1),  # [K H W] b
 ):
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
             worker, K = chunk // CHUNK, count.shape[0]
-            height, width = depth.shape[0], depth.shape[1]
+            right_end, lower_end = float(width) - BORDER, float(height) - BORDER
             for k in range(K * worker // num_workers, K * (worker + 1) // num_workers):
-                T = [poses[k, i] for i in range(12)]
+                P = [projections[k, i] for i in range(12)]
                 first = k * height * width
                 row = first
                 for v in range(height):
+                    left_x, left_y, left_z = P[1] * v + P[2], P[5] * v + P[6], P[9] * v + P[10]
                     for u in range(width):
-                        Z = depth[v, u]
-                        X, Y = (u - cx) / fx * Z, (v - cy) / fy * Z
-                        z = T[8] * X + T[9] * Y + T[10] * Z + T[11]
+                        own = v * width + u
+                        Z = depth[own]
+                        z = (P[8] * u + left_z) * Z + P[11]
                         inv_z = 1.0 / ti.max(z, NEAR)
-                        x = fx * (T[0] * X + T[1] * Y + T[2] * Z + T[3]) * inv_z + cx
-                        y = fy * (T[4] * X + T[5] * Y + T[6] * Z + T[7]) * inv_z + cy
-                        in_view = (x >= 0) & (x < width - BORDER) & (y >= 0) & (y < height - BORDER)
+                        x = ((P[0] * u + left_x) * Z + P[3]) * inv_z
+                        y = ((P[4] * u + left_y) * Z + P[7]) * inv_z
+                        in_view = (x >= 0) & (x < right_end) & (y >= 0) & (y < lower_end)
                         if (Z > 0) & (z > NEAR) & in_view:
-                            i, j = ti.cast(y, ti.i32), ti.cast(x, ti.i32)
-                            down, right = y - i, x - j
-                            up, left = 1 - down, 1 - right
+                            j, i = ti.cast(x, ti.i32), ti.cast(y, ti.i32)
+                            right, down = x - j, y - i
+                            left, up = 1.0 - right, 1.0 - down
                             weights = [left * up, right * up, left * down, right * down]
+                            corner = first + i * width + j
+                            corners_ = [corner, corner + 1, corner + width, corner + width + 1]
                             nearest, seen = 1e30, 0.0
                             for c in ti.static(range(4)):
-                                measured = depths[k, i + c // 2, j + c % 2]
+                                measured = depths[corners_[c]]
                                 nearest = ti.select((measured > 0) & (measured < nearest), measured, nearest)
-                                seen += weights[c] * changes[k, i + c // 2, j + c % 2]
+                                seen += weights[c] * changes[corners_[c]]
                             if z <= nearest * (1 + OCCLUSION) + OCCLUSION_MARGIN:
-                                own[row], corner[row] = v * width + u, i * width + j
+                                below = i * width + j + width + 1
+                                place[row] = ti.cast(below, ti.i64) << 32 | own
                                 change[row] = seen
                                 for c in ti.static(range(4)):
                                     bilinear[row, c] = weights[c]
@@ -94,16 +100,16 @@ def clear(image: ti.template()):  # four-vectors
 
 @ti.func
 def folded(image: ti.template(), p, width):
-    """What four-vectors hold for pixel p; `image` begins a row and a pixel before the first one."""
+    """What the four-vectors right below hold for pixel p."""
     last = p + width + 1
     return image[last][0] + image[last - 1][1] + image[last - width][2] + image[last - width - 1][3]
 
 
 @ti.func
 def unfold(values: ti.template(), width, image: ti.template()):
-    """Four-vectors of the values at each pixel's corners."""
-    for p in range(image.shape[0] - width - 1):
-        image[p] = ti.Vector([values[p], values[p + 1], values[p + width], values[p + width + 1]])
+    """Four-vectors of the values around each pixel's upper left corner, at that pixel."""
+    for p in range(width + 1, image.shape[0] - width - 1):
+        image[p] = ti.Vector([values[p - width - 1], values[p - width], values[p - 1], values[p]])
 
 
 @ti.func
@@ -120,8 +126,7 @@ def _solve(
     # inputs
     width: ti.i32,
     count: ti.types.ndarray(ti.i32, ndim=1),  # [K]
-    own: ti.types.ndarray(ti.i32, ndim=1),  # [K H W]
-    corner: ti.types.ndarray(ti.i32, ndim=1),  # [K H W]
+    place: ti.types.ndarray(ti.i64, ndim=1),  # [K H W]
     bilinear: corners(1),  # [K H W]
     change: ti.types.ndarray(ndim=1),  # [K H W]
     prior: lanes(1),  # [N / LANES]
@@ -134,7 +139,7 @@ def _solve(
     level_lanes: lanes(1),  # the same memory
     # scratch
     weight: ti.types.ndarray(ndim=1),  # [K H W] robust
-    around: corners(1),  # [H W]
+    around: corners(1),  # [H W + width + 1]
     sums: corners(1),  # [H W + width + 1]
     squares: corners(1),  # [H W + width + 1]
     diagonal: ti.types.ndarray(ndim=1),  # [N] ones in; of the preconditioner
@@ -148,7 +153,7 @@ def _solve(
 ):
     ti.loop_config(serialize=True)
     for reweighting in range(reweightings + 1):
-        n, num_lanes = around.shape[0], level_lanes.shape[0]
+        n, num_lanes = around.shape[0] - width - 1, level_lanes.shape[0]
         # r = A^T W (b - A l) + lambda (prior - l), and the diagonal
         unfold(level, width, around)
         clear(sums)
@@ -158,15 +163,16 @@ def _solve(
             diagonal_lanes[i] = zeros() + prior_weight
         for k in range(count.shape[0]):
             for row in range(k * n, k * n + count[k]):
-                u, c, w = own[row], corner[row], bilinear[row]
+                packed, w = place[row], bilinear[row]
+                u, c = ti.cast(packed, ti.i32), ti.cast(packed >> 32, ti.i32)
                 error = change[row] - level[u] + (w * around[c]).sum()
                 size = ti.select(error < 0, 0.0 - error, error)
                 robust = ti.select((reweighting > 0) & (size > huber), huber / size, 1.0)
                 weight[row] = robust
                 residual[u] = residual[u] + robust * error
                 diagonal[u] = diagonal[u] + robust
-                sums[c + width + 1] = sums[c + width + 1] + (robust * error) * w
-                squares[c + width + 1] = squares[c + width + 1] + robust * w * w
+                sums[c] = sums[c] + (robust * error) * w
+                squares[c] = squares[c] + robust * w * w
         for u in range(n):
             residual[u] = residual[u] - folded(sums, u, width)
             diagonal[u] = 1.0 / (diagonal[u] + folded(squares, u, width))
@@ -182,10 +188,14 @@ def _solve(
                     image_lanes[i] = prior_weight * direction_lanes[i]
                 for k in range(count.shape[0]):
                     for row in range(k * n, k * n + count[k]):
-                        u, c, w = own[row], corner[row], bilinear[row]
+                        u, c, w = (
+                            ti.cast(place[row], ti.i32),
+                            ti.cast(place[row] >> 32, ti.i32),
+                            bilinear[row],
+                        )
                         value = weight[row] * (direction[u] - (w * around[c]).sum())
                         image[u] = image[u] + value
-                        sums[c + width + 1] = sums[c + width + 1] + value * w
+                        sums[c] = sums[c] + value * w
                 for u in range(n):
                     image[u] = image[u] - folded(sums, u, width)
                 step = rho / dot(direction_lanes, image_lanes, num_lanes)
@@ -203,64 +213,69 @@ def _solve(
                     )
 
 
+class _Memory:
+    """Arrays for up to K observations, kept: a fresh one costs as much as what is computed in it."""
+
+    def __init__(self, K: int, n: int, width: int, dtype: torch.dtype) -> None:
+        numpy_dtype = np.float64 if dtype == torch.float64 else np.float32
+        self.changes, self.depths = np.empty((2, K, n), numpy_dtype)
+        self.place = np.empty(K * n, np.int64)
+        self.bilinear = torch.empty(K * n, 4, dtype=dtype)
+        self.change, self.weight = np.empty((2, K * n), numpy_dtype)
+        self.vectors = torch.empty(6, -(-n // LANES) * LANES, dtype=dtype)
+        self.around = torch.empty(3, n + width + 1, 4, dtype=dtype)
+
+
+_memory = functools.lru_cache(maxsize=2)(_Memory)
+
+
 def solve_brightness_image(
     depth: np.ndarray,  # [H, W] of the keyframe, metres, 0 = missing
     intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy, pixels
-    poses: np.ndarray,  # [K, 4, 4] T_camera_keyframe
-    changes: np.ndarray,  # [K, H, W] log brightness since the keyframe
-    depths: np.ndarray,  # [K, H, W] metres, 0 = missing; hidden points are left out
+    poses: Sequence[np.ndarray],  # K times [4, 4] T_camera_keyframe
+    changes: Sequence[np.ndarray],  # K times [H, W] log brightness since the keyframe
+    depths: Sequence[np.ndarray | None],  # K times [H, W] metres, 0 = missing; hidden points are left out
     prior: np.ndarray,  # [H, W] log brightness; stays where nothing was observed
     prior_weight: float,  # lambda
     huber: float,  # log brightness
     iterations: int,  # of conjugate gradients, for each weighting
     reweightings: int,  # after a first solution in which all equations count alike
 ) -> np.ndarray:  # [H, W]
-    """Return the keyframe's log brightness."""
-    K, height, width = changes.shape
-    for name, array, shape in (
-        ("depth", depth, (height, width)),
-        ("poses", poses, (K, 4, 4)),
-        ("depths", depths, changes.shape),
-        ("prior", prior, (height, width)),
-    ):
-        check_shape(name, array, shape)
+    """Return the keyframe's log brightness; one solution at a time, they share their memory."""
+    check_shape("prior", prior, depth.shape)
     if prior_weight <= 0:
         raise ValueError(f"prior_weight: expected a positive weight, got {prior_weight}")
-    dtype, n = float_dtype(), height * width
-    numpy_dtype = np.float64 if dtype == torch.float64 else np.float32
-    if K == 0:
-        return prior.astype(numpy_dtype)
-    depth, poses, changes, depths = (
-        np.ascontiguousarray(a, numpy_dtype) for a in (depth, poses[:, :3].reshape(K, 12), changes, depths)
-    )
-    count = np.empty(K, np.int32)
-    own, corner = np.empty((2, K * n), np.int32)
-    bilinear = torch.empty(K * n, 4, dtype=dtype)
-    change, weight = np.empty((2, K * n), numpy_dtype)
-    _find_rows(
-        depth, poses, changes, depths, *intrinsics, min(workers(), K),
-        count, own, corner, bilinear.numpy(), change,
-    )  # fmt: skip
-    padded = -(-n // LANES) * LANES
-    vectors = torch.empty(6, padded, dtype=dtype)
-    vectors.numpy()[:] = 0
-    start, level, *others = vectors
+    K, (height, width), n = len(changes), depth.shape, depth.size
+    memory = _memory(max(8, 1 << (K - 1).bit_length()), n, width, float_dtype())
+    start, level, *others = memory.vectors
+    memory.vectors.numpy()[:] = 0
     level.numpy()[:n] = start.numpy()[:n] = prior.reshape(-1)
-    sums, squares = torch.empty(2, n + width + 1, 4, dtype=dtype)
-    around = torch.empty(n, 4, dtype=dtype)
-    around.numpy()[:] = 0
-    views = [(a, a.view(-1, LANES)) for a in others]
-    _solve(
-        width, count, own, corner, bilinear, change, start.view(-1, LANES), prior_weight, huber,
-        iterations, reweightings, level, level.view(-1, LANES), weight,
-        around, sums, squares, *(a for pair in views for a in pair),
+    if K == 0:
+        return level.numpy()[:n].reshape(height, width).copy()
+    for k, (changed, seen) in enumerate(zip(changes, depths, strict=True)):
+        check_shape("changes", changed, depth.shape)
+        memory.changes[k] = changed.reshape(-1)
+        memory.depths[k] = 0 if seen is None else seen.reshape(-1)
+    fx, fy, cx, cy = intrinsics
+    C = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    projections = C @ np.array(poses, np.float64)[:, :3]
+    projections[:, :, :3] = projections[:, :, :3] @ np.linalg.inv(C)
+    dtype = memory.changes.dtype
+    count = np.empty(K, np.int32)
+    _find_rows(
+        np.ascontiguousarray(depth, dtype).reshape(-1), projections.reshape(K, 12).astype(dtype),
+        memory.changes.reshape(-1), memory.depths.reshape(-1), height, width, min(workers(), K),
+        count, memory.place, memory.bilinear.numpy(), memory.change,
     )  # fmt: skip
-    return level.numpy()[:n].reshape(height, width)
+    _solve(
+        width, count, memory.place, memory.bilinear, memory.change, start.view(-1, LANES),
+        prior_weight, huber, iterations, reweightings, level, level.view(-1, LANES),
+        memory.weight, *memory.around, *(a for o in others for a in (o, o.view(-1, LANES))),
+    )  # fmt: skip
+    return level.numpy()[:n].reshape(height, width).copy()
 
 
 def compile_kernels() -> None:
     """Compile what a solution needs, so that the first frames of a sequence need not wait for it."""
     image = np.ones((3, 3), np.float32)
-    solve_brightness_image(
-        image, (1.0, 1.0, 0.0, 0.0), np.eye(4)[None], image[None], image[None], image, 1.0, 1.0, 1, 0
-    )
+    solve_brightness_image(image, (1.0, 1.0, 0.0, 0.0), [np.eye(4)], [image], [image], image, 1.0, 1.0, 1, 0)

@@ -91,6 +91,7 @@ def test_image_is_the_same_for_any_number_of_threads() -> None:
     for threads in (1, 2, 2):  # 2 is what the other tests run with
         kernels.init(threads=threads)
         images.append(solved(prior, seen, 12, 1))
+        solved(-prior, observations(), 12, 1)  # leaves nothing behind
     assert np.array_equal(images[0], images[1])
     assert np.array_equal(images[1], images[2])
 
