@@ -8,7 +8,7 @@ log brightness l; A l = b are all of them, and the image minimises
 by conjugate gradients on the normal equations A^T W A + lambda, preconditioned by their diagonal and
 reweighted. A row of A is 1 at u and minus four bilinear weights at the corners around x_k(u): read and
 written as one vector, from and to an image of four-vectors. One worker takes the rows in their order, so that
-sums are the same for any number of workers; waking a second one twice an iteration costs more than it saves.
+sums are the same for any number of workers.
 """
 
 import functools
