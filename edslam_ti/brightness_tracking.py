@@ -310,6 +310,8 @@ class BrightnessTracker:
             return "brightness image given up"
         if not is_good:
             return ""
+        if moment.depth is not None:
+            self._settle(moment)
         is_new = moment.depth is not None and overlap < self._config.min_overlap
         if is_new:
             self._old_keyframes.append(keyframe)
@@ -317,10 +319,45 @@ class BrightnessTracker:
         elif moment.index < keyframe.next_solution:
             return ""
         self._solve()
-        # Poses without depth hang on the image alone: they gain most from a better one.
-        self._realign([m for m in self._moments if m.depth is None])
         keyframe.next_solution = moment.index + max(MIN_SOLVE_FRAMES, moment.index - keyframe.index)
         return self._revisit() if is_new else ""
+
+    def _settle(self, moment: _Moment) -> None:
+        """Correct the poses between the last two frames with depth.
+
+        They hang on brightness alone. What brightness alone gets wrong shows at both ends, where depth
+        tells the pose; in between it changes little by little.
+        """
+        keyframe = self._keyframe
+        assert keyframe is not None
+        between: list[_Moment] = []
+        for before in reversed(self._moments[:-1]):
+            if before.depth is not None:
+                break
+            between.append(before)
+        if not between or before.depth is None:
+            return
+        self._solve()
+
+        def by_brightness(m: _Moment) -> np.ndarray | None:  # [4, 4]
+            if m.index == keyframe.index:
+                return self._path.pose(m.index)
+            aligned = self._align(keyframe, keyframe.image_at(m), None, self._path.pose(m.index))
+            return (
+                aligned.T_world_camera if self._judged(aligned, self._path.pose(m.index)).converged else None
+            )
+
+        ends = []
+        for m in (before, moment):
+            T = by_brightness(m)
+            if T is None:
+                return
+            ends.append(log_vector(rigid_inverse(T) @ self._path.pose(m.index)))
+        for m in between:
+            T = by_brightness(m)
+            if T is not None:
+                share = (m.index - before.index) / (moment.index - before.index)
+                self._path.replace(m.index, T @ exp_matrix((1 - share) * ends[0] + share * ends[1]))
 
     def _solve(self, reweightings: int = 1, iterations: int = 12) -> None:
         """Solve for the keyframe's image from the last frames, and choose its pixels to align."""
