@@ -86,16 +86,19 @@ class MappingConfig(Stage):
     """False: track only, build no map."""
     iterations: int = Field(5, ge=0)
     """Optimisation steps after each frame."""
-    final_iterations: int = Field(800, ge=0)
+    final_iterations: int = Field(400, ge=0)
     """Steps over all keyframes after the last frame."""
+    budget: float | None = Field(None, gt=0)
+    """Seconds of mapping per second of data, steps left out to keep to it (results then depend on the
+    machine's speed); taking in depth and solving brightness are never left out. Omitted: no limit."""
     pixel_stride: int = Field(2, ge=1)
     """One new Gaussian for every stride x stride pixels that need one."""
     min_visibility: float = Field(0.8, gt=0, lt=1)
     """lambda_V of Eq. 13: pixels with less alpha get new Gaussians (Sec. IV-A)."""
     depth_error_factor: float = Field(50.0, gt=0)
     """lambda_MDE of Eq. 13: so many median depth errors also ask for new Gaussians (Sec. IV-A)."""
-    max_gaussians: int = Field(200_000, ge=1)
-    """No Gaussians are added beyond this."""
+    max_gaussians: int = Field(300_000, ge=1)
+    """No Gaussians are added beyond this; beyond half of it, the fuller the map, the coarser the new ones."""
     initial_size: float = Field(0.25, gt=0)
     """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
     initial_opacity: float = Field(0.95, gt=0, lt=1)
@@ -110,7 +113,7 @@ class MappingConfig(Stage):
     """At most so many frames are kept to optimise the map for; older ones are thinned out."""
     event_weight: float = Field(1.0, ge=0)
     """lambda_event of Eq. 16 (paper: 0.7)."""
-    depth_weight: float = Field(0.25, ge=0)
+    depth_weight: float = Field(0.75, ge=0)
     """lambda_d of Eq. 16 (paper: 0.05)."""
     scale_weight: float = Field(0.01, ge=0)
     """lambda_reg of Eq. 16 (paper: 0.25)."""

@@ -8,6 +8,7 @@ import numpy as np
 from edslam_ti.brightness import EventView, block_means, solve_start_image
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
+from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 from edslam_ti.keyframes import EventArchive
 from edslam_ti.trajectory import Trajectory
@@ -18,6 +19,8 @@ THOROUGH = {4: 100, 2: 80}  # the same at the end
 GIVEN_VIEWS = 6  # frames of earlier stretches that a start image is tied to
 DETAIL_SIGMA = 4.0  # px; smaller details of the start image come from the map
 DETAIL_RATE = 0.1  # share of a view's difference that they take over
+HOT = 10.0  # times the median of a pixel's neighbours: it fires by itself
+HOT_EVENTS = 100  # fewer do not make a pixel hot
 
 
 @dataclass
@@ -43,12 +46,21 @@ class EventImages:
         self._archive = EventArchive(camera.shape)
         self._depths: dict[int, np.ndarray | None] = {}
         self._stretches: list[_Stretch] = []
+        self._num_events = np.zeros(camera.shape, np.float32)
+        self.hot = np.zeros(
+            camera.shape, bool
+        )  # pixels that fire by themselves; neighbours stand in for them
         self._started = -np.inf  # time of the current stretch's first frame
 
     @property
     def frames(self) -> list[int]:
         """Frames that have an image, in order of time."""
         return self._archive.frames
+
+    @property
+    def newest_frames(self) -> list[int]:
+        """Frames of the newest stretch."""
+        return [k for k in self.frames if self._stretch(k) is self._stretches[-1]]
 
     def depth(self, index: int) -> np.ndarray | None:
         """Return a frame's measured depth [H, W] in metres, 0 = missing."""
@@ -57,6 +69,7 @@ class EventImages:
     def append(self, frame: Frame, index: int) -> None:
         """Add a frame's events, and its image unless the frame is held out."""
         self._archive.append(frame.events, index, is_kept=not frame.is_held_out)
+        self._find_hot_pixels(frame.events)
         if not frame.is_held_out:
             self._depths[index] = frame.depth
         if not self._stretches:
@@ -79,7 +92,7 @@ class EventImages:
             given = [k for k in self.frames if k < stretch.first][-GIVEN_VIEWS:] if self.is_solved else []
             if not own or len(own) + len(given) < MIN_VIEWS:
                 continue
-            chosen = _evenly(own, self._config.solved_views)
+            chosen = evenly(own, self._config.solved_views)
             views = [self._view(k, trajectory, is_relative=k in chosen) for k in given + chosen]
             solved = solve_start_image(views, self._camera, stretch.start, iterations)
             if not given:  # nothing says what the level is: let it be as it was
@@ -126,14 +139,23 @@ class EventImages:
         return next(s for s in reversed(self._stretches) if s.first <= index)
 
     def _change(self, index: int) -> np.ndarray:
-        return np.float32(self._contrast_threshold) * self._archive.change(index)
+        change = np.float32(self._contrast_threshold) * self._archive.change(index)
+        if self.hot.any():
+            change[self.hot] = cv2.medianBlur(change, 5)[self.hot]
+        return change
+
+    def _find_hot_pixels(self, events: Events) -> None:
+        pixel = events.y.astype(np.int64) * self._camera.width + events.x
+        self._num_events.ravel()[:] += np.bincount(pixel, minlength=self._num_events.size)
+        around = cv2.medianBlur(self._num_events, 5)
+        self.hot = self._num_events > np.maximum(HOT * around, HOT_EVENTS)
 
     def _view(self, index: int, trajectory: Trajectory, is_relative: bool) -> EventView:
         change = self._change(index) if is_relative else self.log_brightness(index)
         return EventView(change, self._depths[index], trajectory.pose(index), is_relative)
 
 
-def _evenly(frames: list[int], most: int) -> list[int]:
+def evenly(frames: list[int], most: int) -> list[int]:
     """Return at most `most` of the frames, spread evenly, the last one among them."""
     if len(frames) <= most:
         return frames

@@ -15,7 +15,6 @@ class Keyframe:
 
     index: int  # of the frame in the trajectory
     timestamp: float  # seconds
-    depth: np.ndarray  # [H, W] float32 metres, 0 = missing
 
 
 def is_keyframe(

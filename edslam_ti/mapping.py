@@ -1,5 +1,7 @@
 """Building the Gaussian map from events and depth, poses refined with it (Sec. III-C to III-E)."""
 
+import math
+import time
 from collections.abc import Callable
 from typing import Protocol
 
@@ -9,7 +11,7 @@ from torch import Tensor
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
-from edslam_ti.event_images import EventImages
+from edslam_ti.event_images import EventImages, evenly
 from edslam_ti.frame import Frame
 from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import orthonormalized, se3_exp
@@ -21,9 +23,11 @@ from edslam_ti.trajectory import Trajectory
 
 Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
 
+ONLINE_SHARE = 0.5  # of the budget, for the steps while the map grows
 ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
 WHITE = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between solutions of the start image
+MAX_RECOLOURED = 24  # frames looked at for the brightness that such a solution gives Gaussians
 FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
 MAX_STRETCH = 4.0  # of a new Gaussian on a surface that falls away
 EVENT_VARIANCE = 0.1  # squared log brightness: scale of the event loss
@@ -90,6 +94,36 @@ class _Poses:
         return pose @ se3_exp(self.deltas[index])
 
 
+class Budget:
+    """Seconds of computing that mapping may take, growing with the seconds of data taken in."""
+
+    def __init__(self, seconds_per_second: float | None) -> None:
+        self.spent = 0.0  # seconds
+        self._rate = seconds_per_second
+        self._first = self._last = float("nan")  # seconds of data
+        self._started: float | None = None  # None: not counting
+
+    def start(self, timestamp: float | None = None) -> None:
+        """Begin to count, with data up to a time stamp."""
+        self._started = time.perf_counter()
+        if timestamp is not None:
+            self._first = timestamp if math.isnan(self._first) else self._first
+            self._last = timestamp
+
+    def stop(self) -> None:
+        """Stop counting."""
+        self.spent, self._started = self._now(), None
+
+    def left(self, share: float = 1.0) -> float:
+        """Return how many seconds are left of a share of all that the data so far allows; below 0: none."""
+        if self._rate is None:
+            return math.inf
+        return share * self._rate * (self._last - self._first) - self._now()
+
+    def _now(self) -> float:
+        return self.spent + (0.0 if self._started is None else time.perf_counter() - self._started)
+
+
 class GaussianMapper:
     """Gaussians from depth, optimised with the poses for what events say has changed since the beginning.
 
@@ -112,6 +146,8 @@ class GaussianMapper:
         self._adjusts_poses = config.mapping.bundle_adjustment and config.poses == "tracked"
         self._refiner = PoseRefiner(config.mapping.poses_rate)
         self._num_frames = 0
+        self.budget = Budget(config.mapping.budget)
+        self.num_steps = 0  # taken so far
 
     @property
     def num_gaussians(self) -> int:
@@ -119,6 +155,17 @@ class GaussianMapper:
 
     def update(self, frame: Frame, trajectory: Trajectory) -> None:
         """Add the frame's events and Gaussians, then optimise over the window."""
+        self.budget.start(frame.timestamp)
+        self._update(frame, trajectory)
+        self.budget.stop()
+
+    def finish(self, trajectory: Trajectory, progress: Progress) -> None:
+        """Refine map and poses over everything kept, with falling learning rates."""
+        self.budget.start()
+        self._finish(trajectory, progress)
+        self.budget.stop()
+
+    def _update(self, frame: Frame, trajectory: Trajectory) -> None:
         index = self._num_frames
         self._num_frames += 1
         self.images.append(frame, index)
@@ -131,23 +178,29 @@ class GaussianMapper:
             self._solve_brightness(trajectory)
         if self.images.is_solved:
             for _ in range(self._config.iterations):
+                if self.budget.left(ONLINE_SHARE) <= 0:
+                    break
                 # A young map's errors would pull the poses along: they are adjusted to the finished one.
                 self._optimise(self._draw_recent(), trajectory, adjusts_poses=False)
         self.images.thin_out(keep={k.index for k in self.keyframes})
         self._prune()
 
-    def finish(self, trajectory: Trajectory, progress: Progress) -> None:
-        """Refine map and poses over everything kept, with falling learning rates."""
-        steps = self._config.final_iterations
+    def _finish(self, trajectory: Trajectory, progress: Progress) -> None:
         if len(self.gaussians) == 0 or not self._solve_brightness(trajectory, is_thorough=True):
             return
-        for k in range(steps):
-            rate = 0.05 ** (k / steps)  # ends at a twentieth
+        allowed, done = self.budget.left(), 0.0
+        for k in range(self._config.final_iterations):
+            if done >= 1:
+                break
+            rate = 0.05**done  # ends at a twentieth
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
-            adjusts_poses = self._adjusts_poses and k >= ADJUST_FROM * steps
+            adjusts_poses = self._adjusts_poses and done >= ADJUST_FROM
             self._optimise(self._draw_any(), trajectory, adjusts_poses)
-            if not progress((k + 1) / steps):
+            done = (k + 1) / self._config.final_iterations
+            if allowed < math.inf:
+                done = max(done, 1 - self.budget.left() / allowed) if allowed > 0 else 1.0
+            if not progress(min(done, 1.0)):
                 break
         self._prune()
 
@@ -166,14 +219,20 @@ class GaussianMapper:
     def _take_in_depth(self, frame: Frame, index: int, trajectory: Trajectory) -> None:
         assert frame.depth is not None
         T = trajectory.pose(index)
-        candidate = Keyframe(index, frame.timestamp, frame.depth)
+        candidate = Keyframe(index, frame.timestamp)
         with torch.no_grad():
             view = self._render(self.gaussians.activated(), torch.from_numpy(T))
-        if not self.keyframes or self._is_keyframe(candidate, view.visible, trajectory):
+        if not self.keyframes or self._is_keyframe(candidate, frame.depth, view.visible, trajectory):
             self.keyframes.append(candidate)
-        self._add_gaussians(candidate, T, view)
+        self._add_gaussians(index, frame.depth, T, view)
 
-    def _is_keyframe(self, frame: Keyframe, visible: Tensor, trajectory: Trajectory) -> bool:
+    def _is_keyframe(
+        self,
+        frame: Keyframe,
+        depth: np.ndarray,  # [H, W] metres, 0 = missing
+        visible: Tensor,  # [N] bool
+        trajectory: Trajectory,
+    ) -> bool:
         last = self.keyframes[-1]
         T_last, T_now = trajectory.pose(last.index), trajectory.pose(frame.index)
         with torch.no_grad():
@@ -181,35 +240,41 @@ class GaussianMapper:
         union = int((visible | seen).sum())
         covisibility = int((visible & seen).sum()) / max(union, 1)
         translation = float(np.linalg.norm(T_now[:3, 3] - T_last[:3, 3]))
-        measured = frame.depth[frame.depth > 0]
+        measured = depth[depth > 0]
         median_depth = float(np.median(measured)) if len(measured) else np.inf
         return is_keyframe(covisibility, translation, median_depth, self._keyframe_config)
 
-    def _add_gaussians(self, frame: Keyframe, T_world_camera: np.ndarray, view: RenderOutput) -> None:
+    def _add_gaussians(
+        self,
+        index: int,  # of the frame
+        depth: np.ndarray,  # [H, W] metres, 0 = missing
+        T_world_camera: np.ndarray,  # [4, 4]
+        view: RenderOutput,
+    ) -> None:
         """Add Gaussians at the pixels that Eq. 13 selects, one per stride x stride block."""
         config = self._config
         mask = densify_mask(
             view.alpha.numpy(),
             view.expected_depth.numpy(),
-            frame.depth,
+            depth,
             config.min_visibility,
             config.depth_error_factor,
         )
-        s = config.pixel_stride
+        s = stride_in_room(config.pixel_stride, len(self.gaussians) / config.max_gaussians)
         grid = np.zeros_like(mask)
         grid[s // 2 :: s, s // 2 :: s] = True
-        points, pixels = depth_to_points(frame.depth, self._camera, T_world_camera, mask & grid)
+        points, pixels = depth_to_points(depth, self._camera, T_world_camera, mask & grid)
         room = config.max_gaussians - len(self.gaussians)
         points, pixels = points[:room], pixels[:room]
         if len(points) == 0:
             return
         x, y = pixels[:, 0], pixels[:, 1]
         # Discs on the surface; small ones sharpen faster than large ones shrink, and Eq. 13 fills the gaps.
-        size = config.initial_size * s * frame.depth[y, x] / self._camera.fx
-        quats, stretch = surface_discs(frame.depth, self._camera, T_world_camera, pixels, MAX_STRETCH)
+        size = config.initial_size * s * depth[y, x] / self._camera.fx
+        quats, stretch = surface_discs(depth, self._camera, T_world_camera, pixels, MAX_STRETCH)
         scales = size[:, None] * np.stack([np.ones_like(size), stretch, np.full_like(size, FLATNESS)], 1)
         if self.images.is_solved:
-            brightness = np.exp(self.images.log_brightness(frame.index)[y, x]) - config.log_epsilon
+            brightness = np.exp(self.images.log_brightness(index)[y, x]) - config.log_epsilon
         else:
             brightness = np.full(len(points), config.background)
         self.gaussians.add(
@@ -231,25 +296,27 @@ class GaussianMapper:
     def _solve_brightness(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
         """Solve the start image, and give the Gaussians the brightness of the images; whether it worked."""
         was_solved = self.images.is_solved
-        before = {k: self.images.log_brightness(k) for k in self.images.frames} if was_solved else {}
+        newest = evenly(self.images.newest_frames, MAX_RECOLOURED)
+        changed = self.images.frames if is_thorough or not was_solved else newest
+        before = {k: self.images.log_brightness(k) for k in changed} if was_solved else {}
         if not self.images.solve(trajectory, is_thorough):
             return False
         if is_thorough or not was_solved:
             self.images.set_white(WHITE)
-        self._recolour(trajectory, before)
+        self._recolour(trajectory, changed, before)
         return True
 
-    def _recolour(self, trajectory: Trajectory, before: dict[int, np.ndarray]) -> None:
-        """Change every Gaussian's log brightness as the images have changed where it is seen.
+    def _recolour(self, trajectory: Trajectory, frames: list[int], before: dict[int, np.ndarray]) -> None:
+        """Change every Gaussian's log brightness as the images of the frames have changed where it is seen.
 
-        Gaussians that no image shows change as all others do on average.
+        Gaussians that no image shows change as all others do on average, if all images have changed.
         """
         n = len(self.gaussians)
         total, count = np.zeros(n), np.zeros(n)
         epsilon = self._config.log_epsilon
         with torch.no_grad():
             gaussians = self.gaussians.activated()
-            for k in self.images.frames:
+            for k in frames:
                 view = self._render(gaussians, torch.from_numpy(trajectory.pose(k)))
                 seen = view.dominant.numpy().ravel()
                 old = before[k] if k in before else np.log(view.intensity.numpy() + epsilon)
@@ -258,12 +325,14 @@ class GaussianMapper:
                 total += np.bincount(seen[drawn], change[drawn], n)
                 count += np.bincount(seen[drawn], minlength=n)
         if count.any():
-            change = np.where(count > 0, total / np.maximum(count, 1), total.sum() / count.sum())
+            everywhere = total.sum() / count.sum() if frames[0] <= self.images.frames[0] else 0.0
+            change = np.where(count > 0, total / np.maximum(count, 1), everywhere)
             level = np.log(gaussians.colors.numpy()[:, 0] + epsilon) + change
             self.gaussians.set_colors(torch.from_numpy((np.exp(level) - epsilon).astype(np.float32))[:, None])
 
     def _optimise(self, index: int, trajectory: Trajectory, adjusts_poses: bool) -> None:
         """One step of Eq. 16 on one frame."""
+        self.num_steps += 1
         config = self._config
         poses = _Poses(trajectory, adjusts_poses)
         gaussians = self.gaussians.activated()
@@ -305,6 +374,18 @@ class GaussianMapper:
         if not self._order:
             self._order = list(self._random.permutation(self.images.frames))
         return int(self._order.pop())
+
+
+def stride_in_room(
+    stride: int,  # pixels, in an empty map
+    fullness: float,  # share of the largest number of Gaussians that there is
+) -> int:
+    """Return the spacing of new Gaussians: beyond half of the map's room, the fuller the coarser.
+
+    A map that is full could not take in new surfaces at all.
+    """
+    room = min(1.0, 2 * (1 - fullness))
+    return math.ceil(stride / math.sqrt(max(room, 1e-3)))
 
 
 def densify_mask(

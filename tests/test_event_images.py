@@ -1,11 +1,14 @@
 """Images from events in a tiny room: close to what a camera would have seen, over several stretches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from edslam_ti.config import MappingConfig, TimeSurfaceConfig
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.event_images import EventImages
+from edslam_ti.events import Events
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.trajectory import Trajectory
 
@@ -84,3 +87,19 @@ def test_number_of_frames_is_bounded_and_keyframes_go_last(
     images.thin_out(keep={1, 3})
     assert len(images.frames) <= 10
     assert {1, 3, len(tiny_samples) - 1} <= set(images.frames)
+
+
+def test_hot_pixels_are_found_and_replaced_by_their_neighbours(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    clean, _ = images_of(tiny_sequence, tiny_samples)
+    assert not clean.hot.any()
+    noisy = []
+    for sample in tiny_samples:
+        x, y = np.repeat(np.array([[30, 40], [77, 12]], np.int16), 40, axis=0).T
+        ones = np.ones(len(x), np.int8)
+        hot = Events(x.copy(), y.copy(), np.full(len(x), sample.timestamp), ones)
+        noisy.append(replace(sample, events=Events.concatenate([sample.events, hot])))
+    images, _ = images_of(tiny_sequence, noisy)
+    assert np.argwhere(images.hot).tolist() == [[12, 77], [40, 30]]
+    assert errors(images, tiny_samples).max() < 1.1 * errors(clean, tiny_samples).max() + 0.02

@@ -9,7 +9,7 @@ from sequences import make_slam, settings
 
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.evaluation import evaluate_images
-from edslam_ti.mapping import GaussianMapper, PoseRefiner, densify_mask
+from edslam_ti.mapping import GaussianMapper, PoseRefiner, densify_mask, stride_in_room
 from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
 
@@ -140,6 +140,25 @@ def test_map_never_exceeds_its_largest_size(
     assert 1000 < mapper.num_gaussians <= 1500
 
 
+def test_fuller_maps_grow_by_coarser_gaussians() -> None:
+    strides = [stride_in_room(2, share) for share in (0.0, 0.5, 0.75, 0.9, 0.99, 1.0)]
+    assert strides == [2, 2, 3, 5, 15, 64]
+
+
+def test_small_map_covers_more_of_what_comes_late(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gaps() -> float:
+        slam, mapper = mapped(tiny_sequence, tiny_samples, max_gaussians=3000, final_iterations=30)
+        assert mapper.num_gaussians <= 3000  # 2400 are of the first view
+        last = mapper.render(mapper._camera, slam.trajectory.pose(len(tiny_samples) - 1))
+        return float((last.alpha < 0.5).mean())
+
+    coarser = gaps()
+    monkeypatch.setattr("edslam_ti.mapping.stride_in_room", lambda stride, fullness: stride)
+    assert coarser < 0.8 * gaps()
+
+
 def test_map_of_a_few_gaussians_is_refined_like_any_other(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
@@ -167,6 +186,38 @@ def test_first_frame_and_distant_frames_are_keyframes(
     assert indices[0] == 0
     assert 2 <= len(indices) < len(tiny_samples) / 2  # 22 cm at a depth of 1.6 m, one every 8 cm
     assert 7 not in indices
+
+
+# --- computing time ---
+
+
+def test_without_budget_every_step_is_taken(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:8], iterations=2, final_iterations=7)
+    assert mapper.num_steps >= 7 + 2 * 3
+    assert mapper.budget.left() == np.inf
+    assert mapper.budget.spent > 0
+
+
+def test_budget_leaves_out_steps_and_is_kept_to(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    many: dict[str, Any] = {"iterations": 50, "final_iterations": 5000}
+    slam, mapper = mapped(tiny_sequence, tiny_samples, budget=6.0, **many)
+    seconds = slam.trajectory.timestamps[-1] - slam.trajectory.timestamps[0]
+    assert 10 < mapper.num_steps < 2000
+    assert mapper.budget.spent < 6.0 * seconds + 1.0  # the step in progress; a busy machine
+    assert corrected_psnr(mapper, slam, tiny_samples, [3, 8, 12]) > 15
+
+
+def test_too_small_a_budget_still_gives_a_map(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:8], budget=1e-6, iterations=5, final_iterations=500)
+    assert mapper.num_gaussians > 2000
+    assert mapper.num_steps == 1  # the first final one finds the time is up
+    assert mapper.budget.left() < 0
 
 
 # --- poses ---
