@@ -108,6 +108,8 @@ def test_metrics_have_every_key_and_are_right(result: Path) -> None:
     assert metrics["num_lost_frames"] == 0
     assert metrics["num_events"] > 50_000
     assert metrics["num_gaussians"] >= 2400
+    assert metrics["num_mapping_steps"] >= 10
+    assert metrics["num_hot_pixels"] == 0
     assert metrics["ate_rmse_cm"] < 0.2
     assert metrics["path_length_m"] == pytest.approx(0.2, abs=0.05)
     assert 10 < metrics["psnr_corrected_db"] < 40
