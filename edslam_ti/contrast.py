@@ -36,6 +36,13 @@ class ContrastThreshold:
     negative: float | None = None
     deviation: float | None = None  # of `value`; systematic errors are larger, 2 % in simulated rooms
 
+    @property
+    def relative(self) -> tuple[float, float]:
+        """Return the positive and the negative threshold divided by `value`; 1 where they are not known."""
+        if self.positive is None or self.negative is None:
+            return 1.0, 1.0
+        return self.positive / self.value, self.negative / self.value
+
 
 def contrast_threshold(
     stated: float | None,  # by the settings

@@ -8,6 +8,7 @@ import numpy as np
 from edslam_ti.brightness import EventView, block_means, solve_start_image
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
+from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 from edslam_ti.keyframes import EventArchive
@@ -38,12 +39,12 @@ class EventImages:
     do not pile up, and tied to frames of earlier stretches. The absolute level is unknown.
     """
 
-    def __init__(self, camera: Camera, contrast_threshold: float, config: MappingConfig) -> None:
+    def __init__(self, camera: Camera, contrast: ContrastThreshold, config: MappingConfig) -> None:
         self.is_solved = False
         self._camera = camera
-        self._contrast_threshold = contrast_threshold
+        self._contrast_threshold = contrast.value
         self._config = config
-        self._archive = EventArchive(camera.shape)
+        self._archive = EventArchive(camera.shape, *contrast.relative)
         self._depths: dict[int, np.ndarray | None] = {}
         self._stretches: list[_Stretch] = []
         self._num_events = np.zeros(camera.shape, np.float32)

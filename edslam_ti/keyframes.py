@@ -36,12 +36,18 @@ class EventArchive:
     simulated rooms; without it, contrast comes out too small).
     """
 
-    STEPS = 10  # units of the stored images in one threshold
-    LEAN = 2  # in these units: 0.2 thresholds
+    STEPS = 50  # units of the stored images in one threshold
+    LEAN = 0.2  # thresholds
 
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self._level = np.zeros(shape, np.int16)  # events since the beginning, by polarity
-        self._last = np.zeros(shape, np.int16)  # polarity of the last event
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        positive: float = 1.0,  # what an event of either polarity stands for, in (mean) thresholds
+        negative: float = 1.0,
+    ) -> None:
+        self._worth = {1: round(self.STEPS * positive), -1: -round(self.STEPS * negative)}  # units
+        self._level = np.zeros(shape, np.int16)  # units, of events since the beginning
+        self._last = np.zeros(shape, np.int16)  # units, towards which the last event leans
         self._last_frame = np.zeros(shape, np.int32)  # frames up to this one know their next event
         self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
 
@@ -57,18 +63,22 @@ class EventArchive:
         """Add the events up to frame `index`; keep the change up to it, if wanted."""
         shape = self._level.shape
         pixel = events.y.astype(np.int64) * shape[1] + events.x
-        next_polarity = np.zeros(shape, np.int16)
-        next_polarity.ravel()[pixel[::-1]] = events.polarity[::-1]  # of repeated pixels the first one stays
-        has_fired = next_polarity != 0
+        lean = np.where(events.polarity > 0, self._worth[1], self._worth[-1]) * self.LEAN
+        lean = np.rint(lean).astype(np.int16)
+        next_lean = np.zeros(shape, np.int16)
+        next_lean.ravel()[pixel[::-1]] = lean[::-1]  # of repeated pixels the first one stays
+        has_fired = next_lean != 0
         for frame, image in self._images.items():
-            image += self.LEAN * next_polarity * (self._last_frame <= frame)
-        self._level += accumulate_polarity(
-            events.x, events.y, events.polarity, np.array([0, len(events)]), shape
-        )[0]
-        self._last.ravel()[pixel] = events.polarity  # of repeated pixels the last one stays
+            image += next_lean * (self._last_frame <= frame)
+        for polarity, worth in self._worth.items():
+            events_of = events.polarity == polarity
+            x, y = events.x[events_of], events.y[events_of]
+            ones = np.ones(len(x), np.int8)
+            self._level += worth * accumulate_polarity(x, y, ones, np.array([0, len(x)]), shape)[0]
+        self._last.ravel()[pixel] = lean  # of repeated pixels the last one stays
         self._last_frame[has_fired] = index
         if is_kept:
-            self._images[index] = self.STEPS * self._level + self.LEAN * self._last
+            self._images[index] = self._level + self._last
 
     def change(self, index: int) -> np.ndarray:  # [H, W] float32
         """Return the change from the beginning to a kept frame, in contrast thresholds."""
@@ -80,6 +90,6 @@ class EventArchive:
 
     def begin_again(self) -> np.ndarray:  # [H, W] float32
         """Count from here on anew; return what has changed up to here. Kept images stay as they are."""
-        change = self._level + 0.1 * self.LEAN * self._last
+        change = (self._level + self._last).astype(np.float32) / self.STEPS
         self._level[:] = 0
-        return change.astype(np.float32)
+        return change

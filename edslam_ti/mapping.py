@@ -11,6 +11,7 @@ from torch import Tensor
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
+from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.event_images import EventImages, evenly
 from edslam_ti.frame import Frame
 from edslam_ti.gaussians import GaussianMap, Gaussians
@@ -131,16 +132,15 @@ class GaussianMapper:
     frames: it is solved (brightness.py), and a step then compares a single view with start + change.
     """
 
-    def __init__(self, camera: Camera, contrast_threshold: float, config: Config) -> None:
+    def __init__(self, camera: Camera, contrast: ContrastThreshold, config: Config) -> None:
         self.gaussians = GaussianMap(config.mapping)
         self.keyframes: list[Keyframe] = []
         self.loss = float("nan")
         self._camera = camera
-        self._contrast_threshold = contrast_threshold
         self._config = config.mapping
         self._keyframe_config = config.keyframes
         self._random = np.random.default_rng(config.seed + 1)
-        self.images = EventImages(camera, contrast_threshold, config.mapping)
+        self.images = EventImages(camera, contrast, config.mapping)
         self._order: list[int] = []  # frames still to come in this round of steps
         # Bundle adjustment refines tracked poses; true ones stay as they are.
         self._adjusts_poses = config.mapping.bundle_adjustment and config.poses == "tracked"

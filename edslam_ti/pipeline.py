@@ -82,7 +82,7 @@ def make_slam(config: Config, sequence: EventDepthSequence, samples: SampledSequ
     """Return the method that the settings name, ready to start at the first sample's true pose."""
     contrast = contrast_of(config, sequence, samples)
     tracker: Tracker
-    tracker, mapper = METHODS[config.method].build(sequence, contrast.value, config)
+    tracker, mapper = METHODS[config.method].build(sequence, contrast, config)
     if config.poses == "truth":
         if sequence.truth is None:
             raise DataError(f"{sequence.scene}: --poses truth needs true poses, and this sequence has none")

@@ -9,6 +9,7 @@ import numpy as np
 
 from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
+from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.evaluation import trajectory_errors
 from edslam_ti.events import Events
@@ -63,7 +64,9 @@ def make_slam(sequence: EventDepthSequence, samples: list[Sample], config: Confi
     """Return a method ready to start at the true pose of the first sample."""
     assert sequence.contrast_threshold is not None
     assert samples[0].T_world_camera is not None
-    tracker, mapper = METHODS[config.method].build(sequence, sequence.contrast_threshold, config)
+    tracker, mapper = METHODS[config.method].build(
+        sequence, ContrastThreshold(sequence.contrast_threshold, "data"), config
+    )
     return Slam(
         FrameBuilder(sequence.camera, config.time_surface),
         TruePoses(sequence.true_pose) if config.poses == "truth" else tracker,

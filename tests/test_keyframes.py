@@ -70,6 +70,15 @@ def test_change_counts_events_and_leans_towards_the_last_and_the_next(
         np.testing.assert_allclose(archive.change(frame), expected, atol=1e-6)
 
 
+def test_events_of_either_polarity_count_as_their_threshold() -> None:
+    archive = EventArchive(CAMERA.shape, positive=0.9, negative=1.1)
+    x, y = np.array([3, 3, 3, 4], np.int16), np.array([2, 2, 2, 1], np.int16)
+    polarity = np.array([1, 1, -1, -1], np.int8)
+    archive.append(Events(x, y, np.arange(4.0), polarity), 0, is_kept=True)
+    assert archive.change(0)[2, 3] == pytest.approx(2 * 0.9 - 1.1 - 0.2 * 1.1)
+    assert archive.change(0)[1, 4] == pytest.approx(-1.1 - 0.2 * 1.1)
+
+
 def test_next_event_may_come_many_frames_later() -> None:
     archive = EventArchive(CAMERA.shape)
     one = Events(np.array([3], np.int16), np.array([2], np.int16), np.array([0.5]), np.array([-1], np.int8))

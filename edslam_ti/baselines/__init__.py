@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # a method's parts load Taichi or Open3D, which `--help` need not wait for
     from edslam_ti.config import Config
+    from edslam_ti.contrast import ContrastThreshold
     from edslam_ti.datasets import EventDepthSequence
     from edslam_ti.mapping import Mapper
     from edslam_ti.tracking import Tracker
 
-    Build = Callable[[EventDepthSequence, float, Config], tuple[Tracker, Mapper]]
+    Build = Callable[[EventDepthSequence, ContrastThreshold, Config], tuple[Tracker, Mapper]]
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Method:
 
 
 def _ed_slam(
-    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
     from edslam_ti.brightness_tracking import BrightnessTracker
     from edslam_ti.mapping import GaussianMapper
@@ -31,14 +32,14 @@ def _ed_slam(
 
     tracker: Tracker
     if config.tracking.brightness:
-        tracker = BrightnessTracker(sequence.camera, contrast_threshold, config.tracking, config.seed)
+        tracker = BrightnessTracker(sequence.camera, contrast.value, config.tracking, config.seed)
     else:
         tracker = BidirectionalPatchTracker(config.tracking, config.seed)
-    return tracker, GaussianMapper(sequence.camera, contrast_threshold, config)
+    return tracker, GaussianMapper(sequence.camera, contrast, config)
 
 
 def _open3d_rgbd(
-    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
     from edslam_ti.baselines.open3d_rgbd import RgbdOdometryTracker, TsdfMapper
 
@@ -46,7 +47,7 @@ def _open3d_rgbd(
 
 
 def _open3d_icp(
-    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
     from edslam_ti.baselines.open3d_rgbd import OdometryTracker, TsdfMapper
 
@@ -54,7 +55,7 @@ def _open3d_icp(
 
 
 def _kiss_icp(
-    sequence: "EventDepthSequence", contrast_threshold: float, config: "Config"
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
     from edslam_ti.baselines.kiss import KissIcpTracker
     from edslam_ti.baselines.open3d_rgbd import TsdfMapper
