@@ -37,12 +37,14 @@ IMAGE_WIDTH = 192  # pixels, roughly
 WINDOW = 12  # frames a keyframe's image is solved from
 OBSERVATIONS = 6  # of them that its equations are taken from
 COARSE_STEPS, FINAL_STEPS = 12, 3  # Levenberg-Marquardt steps a level, and with all depth pixels
-AGREEMENT = 4  # standard deviations by which averaged depths may differ
+AGREEMENT = 4  # standard deviations by which averaged depths may differ,
+SAME_SURFACE = 0.05  # and share of the depth
 MIN_FRAMES = 5  # before the first image is solved
 MIN_FLOW = 1.5  # pixels of brightness images that the scene must have moved before the first image is solved
 STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
 MIN_SOLVE_FRAMES = 3  # between two solutions for one keyframe
 SILENT_SHARE = 0.02  # fewer events than this share of the usual number: the camera or the stream stopped
+SLOWING_SHARE = 0.2  # fewer than this in the frame before: the camera was coming to rest
 SILENT_FLOW = 0.3  # pixels a frame: a camera this fast does not stop within one frame
 MAX_MISFIT = 0.25  # log brightness, median: beyond, the image is not that of the keyframe's surfaces
 MAX_MISFITS = 4  # such frames in a row after which the image is given up
@@ -139,7 +141,7 @@ class BrightnessTracker:
         self._keyframe: _Keyframe | None = None  # None: no image yet
         self._old_keyframes: list[_Keyframe] = []
         self._is_silent, self._silent_since = False, 0  # events are missing; first such frame
-        self._usual_events = 0.0
+        self._usual_events, self._last_count = 0.0, 0
         self._num_misfits = 0
         self._path = _Path(Trajectory())
         compile_kernels()
@@ -182,7 +184,8 @@ class BrightnessTracker:
 
     def _noticed_gap(self, frame: Frame, guess: np.ndarray) -> str:
         """Start anew where events are missing although the camera moves; return what happened."""
-        count, usual = len(frame.events), self._usual_events
+        count, before, usual = len(frame.events), self._last_count, self._usual_events
+        self._last_count = count
         if count >= SILENT_SHARE * usual:
             self._usual_events = count if usual == 0 else 0.9 * usual + 0.1 * count
             return ""
@@ -190,7 +193,7 @@ class BrightnessTracker:
             self._begin_stretch(len(self._path.trajectory))
             return ""
         flow = self._flow(self._keyframe.depth.small, self._path.pose(len(self._path.trajectory) - 1), guess)
-        if flow < SILENT_FLOW:
+        if flow < SILENT_FLOW or before < SLOWING_SHARE * usual:
             return ""  # the camera has stopped: its image stays as it is
         self._give_up_image()
         return "events are missing: depth alone is aligned"
@@ -388,7 +391,8 @@ class BrightnessTracker:
         """Return the keyframe's depth averaged with that of recent frames where they agree."""
         own = keyframe.measured.full
         fx, fy, cx, cy = self._camera.intrinsics
-        gate = AGREEMENT * (self._model.depth_sigma + self._model.depth_sigma_2 * own**2)
+        sigma = self._model.depth_sigma + self._model.depth_sigma_2 * own**2
+        gate = np.minimum(AGREEMENT * sigma, SAME_SURFACE * own)
         total, count = own.copy(), np.ones_like(own)
         T_world_keyframe = self._path.pose(keyframe.index)
         for moment in self._spread(keyframe):
