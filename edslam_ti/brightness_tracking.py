@@ -80,7 +80,6 @@ class _Keyframe:
     """A frame with depth, and the log-brightness image solved for it."""
 
     index: int  # of the frame in the trajectory
-    stretch: int  # of uninterrupted events
     change: np.ndarray  # [h, w] as in `_Moment`
     measured: _Depth  # at its time
     depth: _Depth  # averaged with that of neighbouring frames
@@ -88,11 +87,15 @@ class _Keyframe:
     points: list[Tensor]  # pixels to align, at full and at half size; see `Patches.points`
     depth_points: Tensor | None  # pixels of the full depth image to align
     next_solution: int  # index of the frame at which the image is solved for again
-    is_compared: bool = False  # with older keyframes
 
     def image_at(self, moment: _Moment) -> np.ndarray:  # [h, w]
         """Return the log brightness at another time of the same stretch of events."""
         return self.log_brightness + (moment.change - self.change)
+
+    def reduced(self) -> "_Keyframe":
+        """Return what places are recognised by: a tenth of the memory."""
+        small = _Depth(self.depth.small, self.depth.small)
+        return replace(self, measured=small, depth=small, depth_points=None)
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ class BrightnessTracker:
         self._brightness_only = replace(self._model, depth_weight=0.0)
         self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
         self._change = BrightnessChange(camera.shape)
-        self._stretch, self._stretch_start = 0, 0  # number and first frame of the stretch of events
+        self._stretch_start = 0  # first frame of the stretch of uninterrupted events
         self._moments: list[_Moment] = []  # the last frames of the stretch
         self._keyframe: _Keyframe | None = None  # None: no image yet
         self._old_keyframes: list[_Keyframe] = []
@@ -200,13 +203,13 @@ class BrightnessTracker:
 
     def _give_up_image(self) -> None:
         assert self._keyframe is not None
-        self._old_keyframes.append(self._keyframe)
+        self._old_keyframes.append(self._keyframe.reduced())
         self._keyframe = None
         self._is_silent, self._silent_since = True, len(self._path.trajectory)
         self._begin_stretch(len(self._path.trajectory))
 
     def _begin_stretch(self, index: int) -> None:
-        self._stretch, self._stretch_start = self._stretch + 1, index
+        self._stretch_start = index
         self._change.reset()
         self._moments = []
         self._num_misfits = 0
@@ -248,7 +251,7 @@ class BrightnessTracker:
     def _new_keyframe(self, moment: _Moment, log_brightness: np.ndarray) -> _Keyframe:
         assert moment.depth is not None
         return _Keyframe(
-            moment.index, self._stretch, moment.change, moment.depth, moment.depth, log_brightness,
+            moment.index, moment.change, moment.depth, moment.depth, log_brightness,
             points=[], depth_points=None, next_solution=self._moments[-1].index + MIN_SOLVE_FRAMES,
         )  # fmt: skip
 
@@ -317,7 +320,7 @@ class BrightnessTracker:
             self._settle(moment)
         is_new = moment.depth is not None and overlap < self._config.min_overlap
         if is_new:
-            self._old_keyframes.append(keyframe)
+            self._old_keyframes.append(keyframe.reduced())
             keyframe = self._keyframe = self._new_keyframe(moment, keyframe.image_at(moment))
         elif moment.index < keyframe.next_solution:
             return ""
