@@ -35,8 +35,9 @@ from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, R
 
 IMAGE_WIDTH = 192  # pixels, roughly
 WINDOW = 12  # frames a keyframe's image is solved from
-OBSERVATIONS = 6  # of them that its equations are taken from
-COARSE_STEPS, FINAL_STEPS = 12, 3  # Levenberg-Marquardt steps a level, and with all depth pixels
+OBSERVATIONS = 5  # of them that its equations are taken from
+COARSE_STEPS = 6  # Levenberg-Marquardt steps a level; twice as many without depth
+FINAL_STEPS = 2  # with all depth pixels
 AGREEMENT = 4  # standard deviations by which averaged depths may differ,
 SAME_SURFACE = 0.05  # and share of the depth
 MIN_FRAMES = 5  # before the first image is solved
@@ -448,12 +449,13 @@ class BrightnessTracker:
     ) -> _Aligned:
         """Align an image, and its depth where there is any, to a keyframe, coarse to fine."""
         small = np.zeros_like(image) if depth is None else depth.small
+        steps = COARSE_STEPS if depth is not None else 2 * COARSE_STEPS
         T = start
         for level, view in ((1, [downscaled(image), downscaled_depth(small)]), (0, [image, small])):
             linearise = self._linearised(
                 keyframe, keyframe.points[level], self._model, view, self._cameras[level]
             )
-            T, system = levenberg_marquardt(linearise, T, COARSE_STEPS)
+            T, system = levenberg_marquardt(linearise, T, steps)
         if depth is not None and keyframe.depth_points is not None and self._model.depth_weight > 0:
             # Reduced depth is blurred at edges: the last steps use it as it was measured.
             brightness = self._linearised(
