@@ -25,7 +25,7 @@ from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import inverse
 from edslam_ti.losses import brightness_change, event_loss
 from edslam_ti.output import atomic_file
-from edslam_ti.pipeline import make_slam
+from edslam_ti.pipeline import contrast_of, make_slam
 from edslam_ti.rendering import render
 from edslam_ti.slam import Slam
 from kernels.benchmark import (
@@ -166,12 +166,13 @@ def slam(scene: str, duration: float) -> Iterator[Row]:
     base = Config(scene=scene, duration=duration)
     sequence = open_sequence(base)
     samples = SampledSequence(sequence, 0.0, duration, base.max_interval)
+    contrast = contrast_of(base, sequence, samples)
     runs = {}
     for name, (method, differences) in COMPARED.items():
         config = base.updated({"method": method, **METHODS[method].overrides}).updated(differences)
         config = config.updated({"mapping": {"enabled": False}})
-        runs[f"{name}, tracking"] = make_slam(config, sequence, samples)
-    runs["ed_slam, tracking and mapping"] = make_slam(base, sequence, samples)
+        runs[f"{name}, tracking"] = make_slam(config, sequence, samples, contrast)
+    runs["ed_slam, tracking and mapping"] = make_slam(base, sequence, samples, contrast)
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
     for sample in samples:
         for name, run in runs.items():

@@ -28,6 +28,7 @@ from edslam_ti.tracking import (
     MIN_PIXELS,
     BidirectionalPatchTracker,
     TrackingResult,
+    best_attempt,
     levenberg_marquardt,
 )
 from edslam_ti.trajectory import Trajectory
@@ -278,16 +279,12 @@ class BrightnessTracker:
         keyframe = self._keyframe
         assert keyframe is not None
         image = keyframe.image_at(moment)
-        best: tuple[TrackingResult, float] | None = None
-        for start in (guess, self._path.pose(-1)):  # constant velocity, then a sudden stop
+
+        def attempt(start: np.ndarray) -> tuple[TrackingResult, float]:
             aligned = self._align(keyframe, image, moment.depth, start)
-            result = self._judged(aligned, guess)
-            if best is None or result.quality > best[0].quality:
-                best = result, aligned.overlap
-            if result.converged:
-                break
-        assert best is not None
-        return best
+            return self._judged(aligned, guess), aligned.overlap
+
+        return best_attempt(attempt, guess, self._path.pose(-1))
 
     def _judged(self, aligned: _Aligned, guess: np.ndarray) -> TrackingResult:
         """Return the pose, or the guess and a reason where it cannot be trusted."""

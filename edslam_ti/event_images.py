@@ -48,9 +48,8 @@ class EventImages:
         self._depths: dict[int, np.ndarray | None] = {}
         self._stretches: list[_Stretch] = []
         self._num_events = np.zeros(camera.shape, np.float32)
-        self.hot = np.zeros(
-            camera.shape, bool
-        )  # pixels that fire by themselves; neighbours stand in for them
+        # Pixels that fire by themselves; neighbours stand in for them.
+        self.hot = np.zeros(camera.shape, bool)
         self._started = -np.inf  # time of the current stretch's first frame
 
     @property

@@ -68,19 +68,21 @@ def run(config: Config, console: Console | None = None) -> Path:
 def _prepare(config: Config) -> Run:
     sequence = open_sequence(config)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
+    contrast = contrast_of(config, sequence, samples)
     return Run(
         config,
         sequence,
         samples,
-        make_slam(config, sequence, samples),
+        make_slam(config, sequence, samples, contrast),
         held_out_frames(samples, config.evaluation.hold_out_every),
-        contrast_of(config, sequence, samples),
+        contrast,
     )
 
 
-def make_slam(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> Slam:
+def make_slam(
+    config: Config, sequence: EventDepthSequence, samples: SampledSequence, contrast: ContrastThreshold
+) -> Slam:
     """Return the method that the settings name, ready to start at the first sample's true pose."""
-    contrast = contrast_of(config, sequence, samples)
     tracker: Tracker
     tracker, mapper = METHODS[config.method].build(sequence, contrast, config)
     if config.poses == "truth":

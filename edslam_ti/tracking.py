@@ -33,7 +33,7 @@ class TrackingResult:
     T_world_camera: np.ndarray  # [4, 4]
     converged: bool
     quality: float  # fraction of patch pixels in agreement, 0 to 1
-    message: str = ""  # why it failed
+    message: str = ""  # why it failed, or what else is worth the log
 
 
 class Tracker(Protocol):
@@ -143,17 +143,10 @@ class BidirectionalPatchTracker:
     def _track(
         self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory
     ) -> tuple[TrackingResult, float]:
-        last = trajectory.pose(-1)
-        best: tuple[TrackingResult, float] | None = None
-        for guess in (predicted, last):  # constant velocity, then a sudden stop
-            alignment = self._align(current, guess, trajectory)
-            candidate = self._judge(alignment, predicted)
-            if best is None or candidate[0].quality > best[0].quality:
-                best = candidate
-            if best[0].converged:
-                break
-        assert best is not None
-        return best
+        def attempt(start: np.ndarray) -> tuple[TrackingResult, float]:
+            return self._judge(self._align(current, start, trajectory), predicted)
+
+        return best_attempt(attempt, predicted, trajectory.pose(-1))
 
     def _judge(self, alignment: _Alignment, predicted: np.ndarray) -> tuple[TrackingResult, float]:
         """Return the result and the overlap; a failed alignment falls back to the predicted pose."""
@@ -233,6 +226,23 @@ class BidirectionalPatchTracker:
             patches = extract_patches(level.surface, level.depth, at_level.astype(np.int32), size)
             points.append(patches.points(level.camera.intrinsics))
         return _Reference(frame, points, has_surface)
+
+
+def best_attempt(
+    attempt: Callable[[np.ndarray], tuple[TrackingResult, float]],  # from a start [4, 4]: result, overlap
+    predicted: np.ndarray,  # [4, 4] at constant velocity
+    last: np.ndarray,  # [4, 4] as after a sudden stop
+) -> tuple[TrackingResult, float]:
+    """Return the attempt of better quality; the one from the last pose is made only if the first fails."""
+    best: tuple[TrackingResult, float] | None = None
+    for start in (predicted, last):
+        candidate = attempt(start)
+        if best is None or candidate[0].quality > best[0].quality:
+            best = candidate
+        if candidate[0].converged:
+            break
+    assert best is not None
+    return best
 
 
 def levenberg_marquardt(

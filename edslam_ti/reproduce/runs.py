@@ -21,7 +21,7 @@ from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.errors import ConfigError, EdSlamError
 from edslam_ti.evaluation import trajectory_errors
 from edslam_ti.output import atomic_file
-from edslam_ti.pipeline import make_slam
+from edslam_ti.pipeline import contrast_of, make_slam
 from edslam_ti.reproduce.altered import AlteredSequence
 from edslam_ti.reproduce.cases import MEASURED, Case, Recording
 from edslam_ti.reproduce.recordings import Recordings
@@ -66,7 +66,7 @@ def run_case(
         config = config.updated(read_differences(dataset_file))
     config = config.updated(dict(METHODS[variant.method].overrides)).updated(variant.differences)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
-    slam = make_slam(config, sequence, samples)
+    slam = make_slam(config, sequence, samples, contrast_of(config, sequence, samples))
     lost: dict[str, int] = {}
     for k, sample in enumerate(samples):
         result = slam.process(sample)
