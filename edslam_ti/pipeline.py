@@ -161,6 +161,8 @@ def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", c
             state.num_events += len(sample.events)
             if not result.converged:
                 state.note(f"frame {k} at {sample.timestamp:.3f} s lost: {result.message}")
+            elif result.message:
+                state.note(f"frame {k} at {sample.timestamp:.3f} s: {result.message}")
             if k % ATE_EVERY == 0 and state.sequence.truth is not None:
                 error = ate_rmse_cm(slam.trajectory, state.sequence.truth)
                 ate = "" if error is None else f"  ATE {error:.2f} cm"

@@ -240,6 +240,7 @@ def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
 def test_log_says_what_was_run(result: Path) -> None:
     lines = (result / "log.txt").read_text().splitlines()
     assert "tiny: tiny test room, method ed_slam" in lines[0]
+    assert any("first brightness image" in line for line in lines)
     assert lines[-1].endswith("saved")
 
 
