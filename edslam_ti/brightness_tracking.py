@@ -89,15 +89,17 @@ class _Keyframe:
     points: list[Tensor]  # pixels to align, at full and at half size; see `Patches.points`
     depth_points: Tensor | None  # pixels of the full depth image to align
     next_solution: int  # index of the frame at which the image is solved for again
+    is_new_place: bool = True  # no older keyframe shows much the same
 
     def image_at(self, moment: _Moment) -> np.ndarray:  # [h, w]
         """Return the log brightness at another time of the same stretch of events."""
         return self.log_brightness + (moment.change - self.change)
 
     def reduced(self) -> "_Keyframe":
-        """Return what places are recognised by: a tenth of the memory."""
+        """Return what places are recognised by: a twentieth of the memory."""
         small = _Depth(self.depth.small, self.depth.small)
-        return replace(self, measured=small, depth=small, depth_points=None)
+        nothing = np.zeros((0, 0), np.float32)
+        return replace(self, change=nothing, measured=small, depth=small, points=[], depth_points=None)
 
 
 @dataclass(frozen=True)
@@ -220,7 +222,7 @@ class BrightnessTracker:
         """Align depth alone to the last keyframe's."""
         if moment.depth is None or not moment.depth.small.any():
             return TrackingResult(guess, False, 0.0, "too few events, and no depth to align instead")
-        old, T, depth = self._old_keyframes[-1], guess, moment.depth.small
+        old, T, depth = self._with_points(self._old_keyframes[-1]), guess, moment.depth.small
         for level, image in ((1, downscaled_depth(depth)), (0, depth)):
             linearise = self._linearised(
                 old, old.points[level], self._depth_only, [np.zeros_like(image), image], self._cameras[level]
@@ -318,7 +320,8 @@ class BrightnessTracker:
             self._settle(moment)
         is_new = moment.depth is not None and overlap < self._config.min_overlap
         if is_new:
-            self._old_keyframes.append(keyframe.reduced())
+            if keyframe.is_new_place:
+                self._old_keyframes.append(keyframe.reduced())
             keyframe = self._keyframe = self._new_keyframe(moment, keyframe.image_at(moment))
         elif moment.index < keyframe.next_solution:
             return ""
@@ -382,10 +385,7 @@ class BrightnessTracker:
             iterations=iterations, reweightings=reweightings,
         )  # fmt: skip
         keyframe.log_brightness = image
-        keyframe.points = [
-            self._chosen(image, keyframe.depth.small, 0),
-            self._chosen(downscaled(image), downscaled_depth(keyframe.depth.small), 1),
-        ]
+        keyframe.points = self._points(keyframe)
         keyframe.depth_points = self._depth_points(keyframe.depth.full)
 
     def _fused_depth(self, keyframe: _Keyframe) -> _Depth:
@@ -425,6 +425,11 @@ class BrightnessTracker:
         others = [m for m in self._moments if m.index != keyframe.index]
         count = min(len(others), OBSERVATIONS)
         return [others[round(k)] for k in np.linspace(0, len(others) - 1, count)]
+
+    def _points(self, keyframe: _Keyframe) -> list[Tensor]:
+        """Return pixels to align, at full and at half size."""
+        image, depth = keyframe.log_brightness, keyframe.depth.small
+        return [self._chosen(image, depth, 0), self._chosen(downscaled(image), downscaled_depth(depth), 1)]
 
     def _chosen(self, image: np.ndarray, depth: np.ndarray, level: int) -> Tensor:  # [blocks, 4, LANES]
         """Return random pixels with depth, those with a strong gradient first."""
@@ -519,11 +524,13 @@ class BrightnessTracker:
         assert keyframe is not None
         T_now = self._path.pose(keyframe.index)
         old_enough = [k for k in self._old_keyframes if keyframe.index - k.index >= 2 * WINDOW]
-        in_view = [k for k in old_enough if self._share_in_view(k, T_now) >= REVISIT_OVERLAP]
+        shares = [self._share_in_view(k, T_now) for k in old_enough]
+        in_view = [k for k, share in zip(old_enough, shares) if share >= REVISIT_OVERLAP]
         for old in in_view[:MAX_REVISITS]:  # the oldest has drifted least
             T = self._compared(old, keyframe, T_now)
             if T is None:
                 continue
+            keyframe.is_new_place = max(shares) < self._config.min_overlap
             drift = rigid_inverse(T_now) @ T
             if _is_near(drift, *NO_DRIFT):
                 return ""
@@ -546,6 +553,9 @@ class BrightnessTracker:
                     return f"relocalised by the place of frame {old.index}"
         return "no place recognised" if newest_first else "first brightness image"
 
+    def _with_points(self, old: _Keyframe) -> _Keyframe:
+        return replace(old, points=self._points(old))
+
     def _share_in_view(self, old: _Keyframe, T_world_camera: np.ndarray) -> float:
         camera = self._cameras[0]
         x, y, _, _, _ = self._warped(
@@ -556,7 +566,7 @@ class BrightnessTracker:
 
     def _compared(self, old: _Keyframe, new: _Keyframe, start: np.ndarray) -> np.ndarray | None:
         """Return the new keyframe's pose by alignment to an older one, or None where they do not match."""
-        T = start
+        old, T = self._with_points(old), start
         for _ in range(2):  # images are known up to an offset
             difference = self._difference(old, new.log_brightness, T)
             if len(difference) < MIN_PIXELS // 4:

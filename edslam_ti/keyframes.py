@@ -67,18 +67,27 @@ class EventArchive:
         lean = np.rint(lean).astype(np.int16)
         next_lean = np.zeros(shape, np.int16)
         next_lean.ravel()[pixel[::-1]] = lean[::-1]  # of repeated pixels the first one stays
-        has_fired = next_lean != 0
-        for frame, image in self._images.items():
-            image += next_lean * (self._last_frame <= frame)
+        fired = np.flatnonzero(next_lean)
+        self._lean_towards_next(fired, next_lean.ravel()[fired])
         for polarity, worth in self._worth.items():
             events_of = events.polarity == polarity
             x, y = events.x[events_of], events.y[events_of]
             ones = np.ones(len(x), np.int8)
             self._level += worth * accumulate_polarity(x, y, ones, np.array([0, len(x)]), shape)[0]
         self._last.ravel()[pixel] = lean  # of repeated pixels the last one stays
-        self._last_frame[has_fired] = index
+        self._last_frame.ravel()[fired] = index
         if is_kept:
             self._images[index] = self._level + self._last
+
+    def _lean_towards_next(self, pixels: np.ndarray, lean: np.ndarray) -> None:
+        """Let the kept images since each pixel's last event, mostly few, lean [P] towards its next one."""
+        last_frame = self._last_frame.ravel()[pixels]
+        for frame in reversed(self._images):
+            is_waiting = last_frame <= frame
+            pixels, lean, last_frame = pixels[is_waiting], lean[is_waiting], last_frame[is_waiting]
+            if len(pixels) == 0:
+                return
+            self._images[frame].ravel()[pixels] += lean
 
     def change(self, index: int) -> np.ndarray:  # [H, W] float32
         """Return the change from the beginning to a kept frame, in contrast thresholds."""

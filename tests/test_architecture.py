@@ -41,7 +41,7 @@ RANKS: list[list[str]] = [
     [
         *("edslam_ti.reproduce", "edslam_ti.reproduce.cases", "edslam_ti.reproduce.altered"),
         *("edslam_ti.reproduce.recordings", "edslam_ti.reproduce.runs", "edslam_ti.reproduce.ablations"),
-        *("edslam_ti.reproduce.report", "edslam_ti.reproduce.command"),
+        *("edslam_ti.reproduce.report", "edslam_ti.reproduce.long_stream", "edslam_ti.reproduce.command"),
     ],
     ["apps.*"],
 ]
@@ -82,7 +82,7 @@ LIBRARIES: dict[str, list[str]] = {
         "edslam_ti.reproduce.*",
         "apps.*",
     ],
-    "psutil": ["edslam_ti.pipeline"],
+    "psutil": ["edslam_ti.reproduce.long_stream"],
     "tyro": ["edslam_ti.command_line", "edslam_ti.reproduce.*", "apps.*"],
 }
 USES_OPEN3D = [

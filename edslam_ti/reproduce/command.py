@@ -87,4 +87,47 @@ def ablations(
     print(text)
 
 
-COMMANDS = {"tracking": tracking, "ablations": ablations}
+def long_stream(
+    recording: Path | None = None,
+    scene: str = "office0",
+    duration: float = 60.0,
+    width: int = 384,
+    height: int = 240,
+    config: Path | None = None,
+    length: float = 5.0,
+    out: Path = Path("results/long_stream"),
+    threads: int = 2,
+) -> None:
+    """Measure time per frame, memory and size of the map along a recording, tracking and mapping.
+
+    Args:
+        recording: folder in EventReplica's layout; omitted: the loop through a built-in room
+        scene: built-in room; 60 s of office0 take 8 GB at full size
+        duration: seconds
+        width: of the made recording, pixels
+        height: of the made recording, pixels
+        config: YAML file with settings that differ from the defaults
+        length: seconds of data that a line of the table covers
+        out: folder that receives long_stream.md, long_stream.png and frames.csv
+        threads: CPU threads
+    """
+    import kernels
+    from edslam_ti.config import Config, read_differences
+    from edslam_ti.datasets.builtin import builtin_sequence_folder
+    from edslam_ti.datasets.event_replica import EventReplicaSequence
+    from edslam_ti.reproduce.long_stream import measure
+    from edslam_ti.simulation import SimulationConfig
+
+    kernels.init("cpu", threads=threads)
+    if recording is None:
+        made = SimulationConfig(
+            path="loop", duration=duration, width=width, height=height, compact_events=True
+        )
+        recording = builtin_sequence_folder(scene, made)
+    settings = Config(duration=duration, threads=threads)
+    settings = settings.updated({} if config is None else read_differences(config))
+    measure(EventReplicaSequence(recording), settings, out, length, print)
+    print((out / "long_stream.md").read_text())
+
+
+COMMANDS = {"tracking": tracking, "ablations": ablations, "long_stream": long_stream}
