@@ -13,7 +13,9 @@ states another unit. Found on slider_depth by warping images with its `derived_d
 sensor data) between the true poses: 1/5000 m fits (half and double are four times worse), undistorted fits
 better than distorted, and the poses are camera-to-world in OpenCV axes (x to the right).
 
-Events and images are undistorted here; an event goes to the nearest pixel, or is dropped outside.
+Events and images are undistorted here. Every undistorted pixel takes the events of the sensor's pixel nearest
+to where it is seen, so that none stays without events and none counts those of two: an event may come twice,
+or is dropped.
 """
 
 import hashlib
@@ -89,7 +91,7 @@ class RpgSequence(EventDepthSequence):
         self._image_maps = cv2.initUndistortRectifyMap(
             matrix, self._distortion, np.eye(3), matrix, (width, height), cv2.CV_32FC1
         )
-        self._undistorted_pixel = _undistortion_table(self.camera, self._distortion)
+        self._undistortion = _EventUndistortion(*self._image_maps)
         self.depth(0)
         if image_files:
             self.image(0)
@@ -99,10 +101,7 @@ class RpgSequence(EventDepthSequence):
         return self._events.time_range
 
     def events(self, start: float, end: float) -> Events:
-        raw = self._events.between(start, end)
-        x, y = self._undistorted_pixel[raw.y, raw.x].T
-        inside = x >= 0
-        return Events(x[inside], y[inside], raw.t[inside], raw.polarity[inside])
+        return self._undistortion(self._events.between(start, end))
 
     def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
         return read_depth(self._depth_files[index], self.camera, self._metres_per_unit)
@@ -112,15 +111,35 @@ class RpgSequence(EventDepthSequence):
         return np.asarray(cv2.remap(raw, *self._image_maps, interpolation=cv2.INTER_LINEAR))
 
 
-def _undistortion_table(camera: Camera, distortion: np.ndarray) -> np.ndarray:  # [H, W, 2] int16
-    """Return for every distorted pixel its nearest undistorted one (x, y); (-1, -1) where outside."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
-    pixels = np.stack([u.ravel(), v.ravel()], -1)[:, None]
-    undistorted = cv2.undistortPoints(pixels, camera.matrix, distortion, P=camera.matrix)
-    nearest = np.rint(np.asarray(undistorted).reshape(camera.height, camera.width, 2))
-    outside = ((nearest < 0) | (nearest >= np.array([camera.width, camera.height]))).any(-1)
-    nearest[outside] = -1
-    return nearest.astype(np.int16)
+class _EventUndistortion:
+    """Nearest-neighbour remapping of an image, for the events that make it up.
+
+    Taking every event to the nearest undistorted pixel instead leaves curves of pixels without any, and
+    others with those of two pixels, whose brightness seems to change twice as much.
+    """
+
+    def __init__(
+        self,
+        u: np.ndarray,  # [H, W] float32, column where the sensor sees the undistorted pixel
+        v: np.ndarray,  # [H, W] float32, row
+    ) -> None:
+        height, self._width = u.shape
+        x, y = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
+        is_seen = ((x >= 0) & (x < self._width) & (y >= 0) & (y < height)).ravel()
+        source = (y * self._width + x).ravel()
+        order = np.argsort(source, kind="stable")
+        self._targets = order[is_seen[order]]  # undistorted pixels, sorted by the sensor's pixel
+        number = np.bincount(source[is_seen], minlength=height * self._width)
+        self._first = np.append(0, np.cumsum(number))  # [H W + 1] of a sensor pixel's among the targets
+
+    def __call__(self, events: Events) -> Events:
+        """Return the events as an undistorted camera had sent them, in the same order."""
+        pixel = events.y.astype(np.int64) * self._width + events.x
+        first, number = self._first[pixel], self._first[pixel + 1] - self._first[pixel]
+        event = np.repeat(np.arange(len(pixel)), number)
+        rank = np.arange(len(event)) - np.repeat(np.cumsum(number) - number, number)
+        y, x = np.divmod(self._targets[first[event] + rank], self._width)
+        return Events(x.astype(np.int16), y.astype(np.int16), events.t[event], events.polarity[event])
 
 
 def _read_image_list(folder: Path) -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
