@@ -109,7 +109,7 @@ class MappingConfig(Stage):
     """Seconds of events that count from one start image; then a new one, lest errors pile up."""
     solved_views: int = Field(24, ge=3)
     """At most so many frames of a stretch are compared when its start image is solved."""
-    max_views: int = Field(200, ge=10)
+    max_views: int = Field(150, ge=10)
     """At most so many frames are kept to optimise the map for; older ones are thinned out."""
     event_weight: float = Field(1.0, ge=0)
     """lambda_event of Eq. 16 (paper: 0.7)."""

@@ -130,6 +130,8 @@ class EventImages:
             densest = min(candidates, key=lambda i: frames[i + 1] - frames[i - 1])
             self._archive.forget(frames[densest])
             del self._depths[frames[densest]]
+            in_use = {self._stretch(k).first for k in self.frames}
+            self._stretches = [s for s in self._stretches[:-1] if s.first in in_use] + self._stretches[-1:]
 
     def _begin(self, first: int, time: float, start: np.ndarray) -> None:
         self._stretches.append(_Stretch(first, start.astype(np.float32)))

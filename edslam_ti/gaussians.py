@@ -1,10 +1,13 @@
 """The Gaussian map (Sec. III-C): parameters, activations, and an Adam optimiser that grows with it."""
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from edslam_ti.config import MappingConfig
 
@@ -26,6 +29,18 @@ class Gaussians:
     colors: Tensor  # [N, 1] brightness in (0, 1)
 
 
+class Moments(NamedTuple):
+    """Adam's running means of a parameter's gradient and of its square."""
+
+    first: Tensor
+    second: Tensor
+
+    @classmethod
+    def zeros_like(cls, value: Tensor) -> Self:
+        """Return those before the first step."""
+        return cls(torch.zeros_like(value), torch.zeros_like(value))
+
+
 class GaussianMap:
     """N Gaussians as raw (unbounded) parameters: means [N, 3] in metres (world), quats [N, 4] wxyz,
     log_scales [N, 3], logit_opacities [N], logit_colors [N, 1] (brightness in (0, 1) behind a sigmoid).
@@ -44,14 +59,15 @@ class GaussianMap:
             "logit_opacities": config.opacities_rate,
             "logit_colors": config.colors_rate,
         }
-        self._raw: dict[str, Tensor] = {}
-        self._adam = torch.optim.Adam([torch.empty(0)])
+        self._rate_factor = 1.0
+        self._raw = {name: value.requires_grad_() for name, value in empty.items()}
+        self._moments = {name: Moments.zeros_like(value) for name, value in empty.items()}
+        self._steps = 0
         self._cell_sizes = torch.tensor(config.brightness_cells)
         self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
         self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
         self._cell_adam = torch.optim.Adam([self._cell_table], lr=config.cells_rate, eps=1e-15, fused=True)
         self._cell_rate = config.cells_rate
-        self._replace(empty, moments=None)
 
     def __len__(self) -> int:
         return len(self._raw["means"])
@@ -74,6 +90,23 @@ class GaussianMap:
             (raw["logit_colors"] + shared.sum(-1, keepdim=True)).sigmoid(),
         )
 
+    def part(self, chosen: Tensor) -> "GaussianMap":  # [M] indices
+        """Return some of the Gaussians as a map of their own, to be optimised at their cost alone.
+
+        `take_over` brings back what has become of them. The cells are shared with it from the beginning.
+        """
+        part = copy.copy(self)
+        part._map_rows(lambda table: table.index_select(0, chosen))
+        return part
+
+    def take_over(self, part: "GaussianMap", chosen: Tensor) -> None:  # [M] indices, as given to `part`
+        """Overwrite the chosen Gaussians and their moments with those of a part."""
+        for name, value in self._raw.items():
+            value.detach().index_copy_(0, chosen, part._raw[name].detach())
+            for mine, theirs in zip(self._moments[name], part._moments[name]):
+                mine.index_copy_(0, chosen, theirs)
+        self._steps = part._steps
+
     def add(
         self,
         means: Tensor,  # [M, 3] metres
@@ -94,21 +127,15 @@ class GaussianMap:
             "logit_opacities": torch.full((m,), opacity).logit(),
             "logit_colors": _logit(colors) - shared,
         }
-        moments = {
-            name: {key: torch.cat([value, torch.zeros_like(new[name])]) for key, value in state.items()}
-            for name, state in self._moments().items()
-        }
-        joined = {name: torch.cat([self._raw[name].detach(), new[name]]) for name in PARAMETERS}
-        self._replace(joined, moments)
+        for name, rows in new.items():
+            self._raw[name] = torch.cat([self._raw[name].detach(), rows]).requires_grad_()
+            self._moments[name] = Moments(
+                *(torch.cat([moment, torch.zeros_like(rows)]) for moment in self._moments[name])
+            )
 
     def keep(self, mask: Tensor) -> None:
         """Keep the Gaussians where mask [N] is true."""
-        self._cells = self._cells[mask]
-        moments = {
-            name: {key: value[mask] for key, value in state.items()}
-            for name, state in self._moments().items()
-        }
-        self._replace({name: value.detach()[mask] for name, value in self._raw.items()}, moments)
+        self._map_rows(lambda table: table[mask])
 
     def set_colors(self, colors: Tensor) -> None:  # [N, 1] in (0, 1)
         """Overwrite every Gaussian's brightness; the cells keep theirs."""
@@ -118,16 +145,26 @@ class GaussianMap:
 
     def step(self) -> None:
         """Take one Adam step along the gradients, and clear them."""
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        for name, value in self._raw.items():
+            if value.grad is not None:
+                self._move(value, self._moments[name], self._rates[name] * self._rate_factor)
+                value.grad = None
         self._cell_adam.step()
         self._cell_adam.zero_grad(set_to_none=True)
         self._steps += 1
 
+    @torch.no_grad()
+    def _move(self, value: Tensor, moments: "Moments", rate: float) -> None:
+        assert value.grad is not None
+        adam(
+            [value], [value.grad], [moments.first], [moments.second], [], [torch.tensor(float(self._steps))],
+            amsgrad=False, beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-15, maximize=False,
+            fused=True,  # one pass over the memory instead of eight
+        )  # fmt: skip
+
     def decay_rates(self, factor: float) -> None:
         """Set every learning rate to `factor` times its configured value."""
-        for group in self._adam.param_groups:
-            group["lr"] = self._rates[group["name"]] * factor
+        self._rate_factor = factor
         self._cell_adam.param_groups[0]["lr"] = self._cell_rate * factor
 
     def _cells_of(self, means: Tensor) -> Tensor:  # [M, 3] -> [M, L]
@@ -136,35 +173,11 @@ class GaussianMap:
         hashed = (grid * torch.tensor(CELL_PRIMES)).sum(-1) % CELL_TABLE
         return hashed + CELL_TABLE * torch.arange(len(self._cell_sizes))
 
-    def _moments(self) -> dict[str, dict[str, Tensor]]:
-        """Return Adam's first and second moments by parameter; zeros before the first step."""
-        moments = {}
-        for name, value in self._raw.items():
-            state = self._adam.state.get(value, {})
-            moments[name] = {
-                key: state.get(key, torch.zeros_like(value)).detach() for key in ("exp_avg", "exp_avg_sq")
-            }
-        return moments
-
-    def _replace(self, values: dict[str, Tensor], moments: dict[str, dict[str, Tensor]] | None) -> None:
-        self._raw = {name: value.contiguous().requires_grad_() for name, value in values.items()}
-        factors = {
-            g["name"]: g["lr"] / self._rates[g["name"]] for g in self._adam.param_groups if "name" in g
-        }
-        self._adam = torch.optim.Adam(
-            [
-                {"params": [value], "lr": self._rates[name] * factors.get(name, 1.0), "name": name}
-                for name, value in self._raw.items()
-            ],
-            eps=1e-15,
-            fused=True,  # one pass over the memory instead of eight
-        )
-        if moments is None:
-            self._steps = 0
-            return
-        if self._steps:
-            for name, value in self._raw.items():
-                self._adam.state[value] = {"step": torch.tensor(float(self._steps)), **moments[name]}
+    def _map_rows(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Replace every table of one row a Gaussian."""
+        self._cells = change(self._cells)
+        self._raw = {name: change(value.detach()).requires_grad_() for name, value in self._raw.items()}
+        self._moments = {name: Moments(*map(change, pair)) for name, pair in self._moments.items()}
 
 
 def _logit(colors: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from edslam_ti.geometry import orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
 from edslam_ti.pointcloud import depth_to_points, surface_discs
-from edslam_ti.rendering import RenderOutput, View, render, render_view
+from edslam_ti.rendering import RenderOutput, View, drawable, render, render_view
 from edslam_ti.trajectory import Trajectory
 
 Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
@@ -335,12 +335,17 @@ class GaussianMapper:
         self.num_steps += 1
         config = self._config
         poses = _Poses(trajectory, adjusts_poses)
-        gaussians = self.gaussians.activated()
+        T = poses.of_frame(index)
+        # What is out of view costs nothing, however large the map.
+        chosen = drawable(self.gaussians, self._camera, T)
+        if len(chosen) == 0:
+            return
+        part = self.gaussians.part(chosen)
         measured = self.images.depth(index)
         view = view_loss(
-            gaussians,
+            part.activated(),
             self._camera,
-            poses.of_frame(index),
+            T,
             torch.from_numpy(self.images.log_brightness(index)),
             None if measured is None else torch.from_numpy(measured),
             config.background,
@@ -350,10 +355,11 @@ class GaussianMapper:
         self.images.take_over_details(index, view.difference.numpy())
         loss = view.loss
         if config.scale_weight > 0:
-            log_scales = self.gaussians.raw["log_scales"]
+            log_scales = part.raw["log_scales"]
             loss = loss + config.scale_weight * scale_loss(log_scales, config.max_scale_ratio)
         loss.backward()
-        self.gaussians.step()
+        part.step()
+        self.gaussians.take_over(part, chosen)
         for frame, delta in poses.deltas.items():
             if delta.grad is not None:
                 self._refiner.step(frame, delta.grad.numpy(), trajectory)

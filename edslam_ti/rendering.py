@@ -1,5 +1,6 @@
 """Views of a Gaussian map."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,11 @@ from torch import Tensor
 from edslam_ti.camera import Camera
 from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import inverse
-from kernels.projection import LOW_PASS
+from kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA, NEAR
 from kernels.rasterization import rasterize
 
-MIN_ALPHA = 1e-3  # below this there is no depth to speak of
+MIN_DRAWN = 1e-3  # alpha; below this there is no depth to speak of
+REACH = math.sqrt(-2 * math.log(MIN_ALPHA))  # standard deviations to where an opaque Gaussian ends
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,8 @@ class RenderOutput:
     @property
     def expected_depth(self) -> Tensor:
         """Depth of what is drawn: Eq. 8's sum divided by alpha, 0 where nothing is drawn."""
-        depth = self.depth / self.alpha.clamp_min(MIN_ALPHA)
-        return torch.where(self.alpha > MIN_ALPHA, depth, torch.zeros_like(depth))
+        depth = self.depth / self.alpha.clamp_min(MIN_DRAWN)
+        return torch.where(self.alpha > MIN_DRAWN, depth, torch.zeros_like(depth))
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,33 @@ def render(
     )
     intensity = drawn.image[..., 0] + (1 - drawn.alpha) * background
     return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible, drawn.dominant)
+
+
+@torch.no_grad()
+def drawable(
+    gaussians: GaussianMap,  # of N
+    camera: Camera,
+    T_world_camera: Tensor,  # [4, 4]
+) -> Tensor:  # [M] indices
+    """Return the Gaussians that may show; the others lie behind the camera or end outside the image."""
+    T = inverse(T_world_camera.detach()).float()
+    x, y, z = (gaussians.raw["means"].detach() @ T[:3, :3].T + T[:3, 3]).unbind(-1)
+    u, v = camera.fx * x / z, camera.fy * y / z  # pixels from the principal point
+    width, height = camera.width, camera.height
+    is_near = (z > NEAR) & _is_within(u + camera.cx, width, MARGIN * width)
+    is_near &= _is_within(v + camera.cy, height, MARGIN * height)  # farther off, rendering culls them
+    near = torch.nonzero(is_near).squeeze(1)
+    u, v, z = u[near], v[near], z[near]
+    sigma = gaussians.raw["log_scales"].detach().index_select(0, near).amax(-1).exp()
+    # The variance in the image is at most that of a ball as large, Eq. 7.
+    reach_u = REACH * torch.sqrt((camera.fx**2 + u**2) * (sigma / z) ** 2 + LOW_PASS)
+    reach_v = REACH * torch.sqrt((camera.fy**2 + v**2) * (sigma / z) ** 2 + LOW_PASS)
+    reaches = _is_within(u + camera.cx, width, reach_u) & _is_within(v + camera.cy, height, reach_v)
+    return near[reaches]
+
+
+def _is_within(position: Tensor, size: int, margin: Tensor | float) -> Tensor:  # [N] pixels -> bool
+    return (position > -1 - margin) & (position < size + margin)
 
 
 def reduced_low_pass(reduction: int) -> float:

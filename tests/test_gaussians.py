@@ -99,6 +99,25 @@ def test_moments_follow_their_gaussians_through_adding_and_keeping() -> None:
     step()
 
 
+def test_a_part_is_optimised_as_the_whole_would_be_and_the_rest_stays() -> None:
+    whole, same = GaussianMap(CONFIG), GaussianMap(CONFIG)
+    for gaussians in (whole, same):
+        add(gaussians, 60)
+    before = {name: value.detach().clone() for name, value in whole.raw.items()}
+    chosen = torch.arange(0, 60, 2)
+    for _ in range(3):
+        part = whole.part(chosen)
+        for optimised, indices in ((part, torch.arange(30)), (same, chosen)):
+            shown = optimised.activated()
+            (shown.colors[indices].square().sum() + shown.scales[indices].prod(-1).sum()).backward()
+            optimised.step()
+        whole.take_over(part, chosen)
+    torch.testing.assert_close(whole.activated().colors, same.activated().colors)
+    for name, value in whole.raw.items():
+        torch.testing.assert_close(value[chosen], same.raw[name][chosen], msg=name)
+        assert torch.equal(value[1::2], before[name][1::2]), name
+
+
 def test_kept_gaussians_keep_their_brightness_after_cells_have_moved() -> None:
     gaussians = GaussianMap(CONFIG)
     add(gaussians, 50)

@@ -6,7 +6,7 @@ import torch
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
 from edslam_ti.gaussians import GaussianMap
-from edslam_ti.rendering import reduced_low_pass, render, render_view
+from edslam_ti.rendering import drawable, reduced_low_pass, render, render_view
 from kernels.projection import LOW_PASS
 
 CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
@@ -49,6 +49,20 @@ def test_wall_is_seen_at_its_depth_and_brightness() -> None:
     np.testing.assert_allclose(view.intensity, 0.8, rtol=1e-4)
     np.testing.assert_allclose(view.depth, 2.0, rtol=1e-4)
     assert view.alpha.min() > 0.9
+
+
+def test_gaussians_that_cannot_be_drawn_change_no_pixel() -> None:
+    gaussians = wall(2.0)
+    gaussians.raw["log_scales"].data[::7] += 1.5  # some reach into the image from far outside
+    pose = torch.eye(4)
+    pose[0, 3], pose[2, 3] = 1.2, 1.0
+    chosen = drawable(gaussians, CAMERA, pose)
+    whole, part = (render(g.activated(), CAMERA, pose, 0.5) for g in (gaussians, gaussians.part(chosen)))
+    assert torch.equal(part.intensity, whole.intensity)
+    assert torch.equal(part.depth, whole.depth)
+    assert torch.equal(part.visible, whole.visible[chosen])
+    assert int(whole.visible.sum()) == int(part.visible.sum())
+    assert len(chosen) < 0.25 * len(gaussians)
 
 
 def test_camera_that_steps_back_sees_the_wall_farther_away() -> None:
