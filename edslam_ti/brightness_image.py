@@ -67,9 +67,12 @@ def solve_log_brightness_image(
     prior: np.ndarray,  # [h, w] log brightness before; stays where nothing was observed
     prior_weight: float = 1e-3,  # against one equation
     iterations: int = 12,
-    reweightings: int = 1,
+    is_robust: bool = True,
 ) -> np.ndarray:  # [h, w] float32
-    """Return the keyframe's log brightness by conjugate gradients, robustly reweighted."""
+    """Return the keyframe's log brightness by conjugate gradients.
+
+    `is_robust`: equations that the prior fits badly count less (Huber).
+    """
     return brightness_image.solve_brightness_image(
         depth,
         camera.intrinsics,
@@ -80,7 +83,7 @@ def solve_log_brightness_image(
         prior_weight,
         HUBER,
         iterations,
-        reweightings,
+        is_robust,
     )
 
 

@@ -32,15 +32,15 @@ from edslam_ti.tracking import (
     levenberg_marquardt,
 )
 from edslam_ti.trajectory import Trajectory
+from kernels import depth_average
+from kernels.depth_average import DepthAgreement, PixelRays, average_depth
 from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, ResidualModel
 
 IMAGE_WIDTH = 192  # pixels, roughly
 WINDOW = 12  # frames a keyframe's image is solved from
 OBSERVATIONS = 5  # of them that its equations are taken from
 COARSE_STEPS = 6  # Levenberg-Marquardt steps a level; twice as many without depth
-FINAL_STEPS = 2  # with all depth pixels
-AGREEMENT = 4  # standard deviations by which averaged depths may differ,
-SAME_SURFACE = 0.05  # and share of the depth
+SMALL_GAIN = 0.01  # relative decrease of the cost: near enough for the next, finer level
 MIN_FRAMES = 5  # before the first image is solved
 MIN_FLOW = 1.5  # pixels of brightness images that the scene must have moved before the first image is solved
 STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
@@ -126,7 +126,8 @@ class BrightnessTracker:
         self._config = config
         # Images are halved until they are about 192 pixels wide: the noise of events averages out.
         self._level = max(0, round(math.log2(camera.width / IMAGE_WIDTH)))
-        self._camera, self._rays = camera, camera.rays().astype(np.float32)
+        self._camera = camera
+        self._rays = PixelRays(camera.shape, camera.intrinsics)
         self._cameras = [camera.downscaled(2 ** (self._level + k)) for k in range(2)]
         self._contrast_threshold = contrast_threshold
         self._random = np.random.default_rng(seed + 1)
@@ -152,6 +153,7 @@ class BrightnessTracker:
         self._num_misfits = 0
         self._path = _Path(Trajectory())
         compile_kernels()
+        depth_average.compile_kernels()
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame`; earlier poses on the trajectory may be corrected."""
@@ -245,7 +247,7 @@ class BrightnessTracker:
         if self._flow(moment.depth.small, self._path.pose(moment.index), self._path.newest) < MIN_FLOW:
             return False
         self._keyframe = self._new_keyframe(moment, np.zeros_like(moment.depth.small))
-        self._solve(reweightings=0, iterations=40)
+        self._solve(iterations=40, is_robust=False)
         for _ in range(2):  # image and poses in turn
             self._solve()
             self._realign(self._moments)
@@ -366,7 +368,7 @@ class BrightnessTracker:
                 share = (m.index - before.index) / (moment.index - before.index)
                 self._path.replace(m.index, T @ exp_matrix((1 - share) * ends[0] + share * ends[1]))
 
-    def _solve(self, reweightings: int = 1, iterations: int = 12) -> None:
+    def _solve(self, iterations: int = 12, is_robust: bool = True) -> None:
         """Solve for the keyframe's image from the last frames, and choose its pixels to align."""
         keyframe = self._keyframe
         assert keyframe is not None
@@ -382,43 +384,26 @@ class BrightnessTracker:
         ]
         image = solve_log_brightness_image(
             keyframe.depth.small, self._cameras[0], observations, keyframe.log_brightness,
-            iterations=iterations, reweightings=reweightings,
+            iterations=iterations, is_robust=is_robust,
         )  # fmt: skip
         keyframe.log_brightness = image
         keyframe.points = self._points(keyframe)
-        keyframe.depth_points = self._depth_points(keyframe.depth.full)
+        keyframe.depth_points = self._rays.points(keyframe.depth.full)
 
     def _fused_depth(self, keyframe: _Keyframe) -> _Depth:
         """Return the keyframe's depth averaged with that of recent frames where they agree."""
-        own = keyframe.measured.full
-        fx, fy, cx, cy = self._camera.intrinsics
-        sigma = self._model.depth_sigma + self._model.depth_sigma_2 * own**2
-        gate = np.minimum(AGREEMENT * sigma, SAME_SURFACE * own)
-        total, count = own.copy(), np.ones_like(own)
         T_world_keyframe = self._path.pose(keyframe.index)
-        for moment in self._spread(keyframe):
-            if moment.depth is None:
-                continue
-            T = (rigid_inverse(self._path.pose(moment.index)) @ T_world_keyframe).astype(np.float32)
-            direction = self._rays @ T[:3, :3].T
-            p = direction * own[..., None] + T[:3, 3]
-            z = np.maximum(p[..., 2], 0.05)
-            x, y = fx * p[..., 0] / z + cx, fy * p[..., 1] / z + cy
-            further = (cv2.remap(moment.depth.full, x, y, cv2.INTER_LINEAR) - z) / direction[..., 2]
-            agrees = np.abs(further) < gate
-            total += np.where(agrees, own + further, 0)
-            count += agrees
-        full = np.where(own > 0, total / count, 0).astype(np.float32)
-        small = full
+        others = [(m.index, m.depth.full) for m in self._spread(keyframe) if m.depth is not None]
+        small = full = average_depth(
+            keyframe.measured.full,
+            [depth for _, depth in others],
+            [rigid_inverse(self._path.pose(index)) @ T_world_keyframe for index, _ in others],
+            self._rays,
+            DepthAgreement(self._model.depth_sigma, self._model.depth_sigma_2),
+        )
         for _ in range(self._level):
             small = downscaled_depth(small)
         return _Depth(full, small)
-
-    def _depth_points(self, depth: np.ndarray) -> Tensor:  # [blocks, 4, LANES]
-        """Return all pixels of a depth image: noise averages out over them."""
-        v, u = np.nonzero(depth)
-        pixels = np.stack([u, v, 1 / depth[v, u]], -1).astype(np.float32)
-        return Patches(pixels, np.zeros(len(v), np.float32)).points(self._camera.intrinsics)
 
     def _spread(self, keyframe: _Keyframe) -> list[_Moment]:
         """Return recent frames, spread in time, that the keyframe's image is solved from."""
@@ -457,9 +442,9 @@ class BrightnessTracker:
             linearise = self._linearised(
                 keyframe, keyframe.points[level], self._model, view, self._cameras[level]
             )
-            T, system = levenberg_marquardt(linearise, T, steps)
+            T, system = levenberg_marquardt(linearise, T, steps, SMALL_GAIN)
         if depth is not None and keyframe.depth_points is not None and self._model.depth_weight > 0:
-            # Reduced depth is blurred at edges: the last steps use it as it was measured.
+            # Reduced depth is blurred at edges: the last step uses it as it was measured.
             brightness = self._linearised(
                 keyframe, keyframe.points[0], self._brightness_only, [image, small], self._cameras[0]
             )
@@ -470,7 +455,8 @@ class BrightnessTracker:
                 [np.zeros_like(depth.full), depth.full],
                 self._camera,
             )
-            T, _ = levenberg_marquardt(lambda T: brightness(T) + geometry(T), T, FINAL_STEPS)
+            both = brightness(T) + geometry(T)
+            T = T @ exp_matrix(-np.linalg.solve(both.H, both.g))  # Gauss-Newton: the minimum is near
         T = orthonormalized(T)
         difference = self._difference(keyframe, image, T)
         misfit = float(np.median(np.abs(difference))) if len(difference) else np.inf

@@ -249,8 +249,12 @@ def levenberg_marquardt(
     linearise: Callable[[np.ndarray], NormalEquations],
     T_world_camera: np.ndarray,  # [4, 4] start
     iterations: int,
+    small_gain: float = SMALL_GAIN,
 ) -> tuple[np.ndarray, NormalEquations]:
-    """Minimise over T <- T exp(xi), given the normal equations at a pose; return pose and system."""
+    """Minimise over T <- T exp(xi), given the normal equations at a pose; return pose and system.
+
+    It ends when the cost decreases by less than `small_gain` of itself.
+    """
     T, damping = T_world_camera, 1e-4
     system = linearise(T)
     for _ in range(iterations):
@@ -262,7 +266,7 @@ def levenberg_marquardt(
         gain = 1 - _mean_cost(candidate) / _mean_cost(system)
         if gain > 0:
             T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
-            if gain < SMALL_GAIN:
+            if gain < small_gain:
                 break
         else:
             damping *= 8

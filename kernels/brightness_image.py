@@ -5,10 +5,11 @@ log brightness l; A l = b are all of them, and the image minimises
 
     sum of rho((A l - b)_i) + lambda |l - prior|^2,    rho: Huber's function
 
-by conjugate gradients on the normal equations A^T W A + lambda, preconditioned by their diagonal and
-reweighted. A row of A is 1 at u and minus four bilinear weights at the corners around x_k(u): read and
-written as one vector, from and to an image of four-vectors. One worker takes the rows in their order, so that
-sums are the same for any number of workers.
+by conjugate gradients on the normal equations A^T W A + lambda, preconditioned by their diagonal. The
+prior's residuals give the weights W: solving again from a solution reweights. A row of A is 1 at u and
+minus four bilinear weights at the corners around x_k(u): read and written as one vector, from and to an
+image of four-vectors. One worker takes the rows in their order, so that sums are the same for any number
+of workers.
 """
 
 import functools
@@ -133,7 +134,7 @@ def _solve(
     prior_weight: float,
     huber: float,
     iterations: ti.i32,
-    reweightings: ti.i32,
+    is_robust: ti.i32,
     # in and out
     level: ti.types.ndarray(ndim=1),  # [N] N >= H W
     level_lanes: lanes(1),  # the same memory
@@ -152,7 +153,7 @@ def _solve(
     image_lanes: lanes(1),
 ):
     ti.loop_config(serialize=True)
-    for reweighting in range(reweightings + 1):
+    for _ in range(1):  # what is outermost may be split
         n, num_lanes = around.shape[0] - width - 1, level_lanes.shape[0]
         # r = A^T W (b - A l) + lambda (prior - l), and the diagonal
         unfold(level, width, around)
@@ -167,7 +168,7 @@ def _solve(
                 u, c = ti.cast(packed, ti.i32), ti.cast(packed >> 32, ti.i32)
                 error = change[row] - level[u] + (w * around[c]).sum()
                 size = ti.select(error < 0, 0.0 - error, error)
-                robust = ti.select((reweighting > 0) & (size > huber), huber / size, 1.0)
+                robust = ti.select((is_robust > 0) & (size > huber), huber / size, 1.0)
                 weight[row] = robust
                 residual[u] = residual[u] + robust * error
                 diagonal[u] = diagonal[u] + robust
@@ -180,7 +181,7 @@ def _solve(
             direction_lanes[i] = diagonal_lanes[i] * residual_lanes[i]
         rho = dot(residual_lanes, direction_lanes, num_lanes)
         enough = CONVERGED * rho
-        for _ in range(iterations):
+        for _iteration in range(iterations):
             if rho > enough:
                 unfold(direction, width, around)
                 clear(sums)
@@ -238,8 +239,8 @@ def solve_brightness_image(
     prior: np.ndarray,  # [H, W] log brightness; stays where nothing was observed
     prior_weight: float,  # lambda
     huber: float,  # log brightness
-    iterations: int,  # of conjugate gradients, for each weighting
-    reweightings: int,  # after a first solution in which all equations count alike
+    iterations: int,  # of conjugate gradients
+    is_robust: bool,  # equations that the prior fits badly count less, else all alike
 ) -> np.ndarray:  # [H, W]
     """Return the keyframe's log brightness; one solution at a time, they share their memory."""
     check_shape("prior", prior, depth.shape)
@@ -269,7 +270,7 @@ def solve_brightness_image(
     )  # fmt: skip
     _solve(
         width, count, memory.place, memory.bilinear, memory.change, start.view(-1, LANES),
-        prior_weight, huber, iterations, reweightings, level, level.view(-1, LANES),
+        prior_weight, huber, iterations, int(is_robust), level, level.view(-1, LANES),
         memory.weight, *memory.around, *(a for o in others for a in (o, o.view(-1, LANES))),
     )  # fmt: skip
     return level.numpy()[:n].reshape(height, width).copy()
@@ -278,4 +279,6 @@ def solve_brightness_image(
 def compile_kernels() -> None:
     """Compile what a solution needs, so that the first frames of a sequence need not wait for it."""
     image = np.ones((3, 3), np.float32)
-    solve_brightness_image(image, (1.0, 1.0, 0.0, 0.0), [np.eye(4)], [image], [image], image, 1.0, 1.0, 1, 0)
+    solve_brightness_image(
+        image, (1.0, 1.0, 0.0, 0.0), [np.eye(4)], [image], [image], image, 1.0, 1.0, 1, False
+    )
