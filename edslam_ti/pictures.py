@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GAP, HEAD, CAPTION = 6, 34, 20  # pixels between panels, above all of them, above each row
+LETTER = 8  # pixels, height and about the width of letters
 LARGEST_ERROR = 0.25  # brightness at the end of the error's colour scale
 SMOOTHING = 0.1  # seconds, Gaussian width over which the fly-through's path is smoothed
 
@@ -52,44 +53,42 @@ def write_contact_sheet(path: Path, rows: Sequence[PictureRow], panel_width: int
     lefts = [GAP + column * (w + GAP) for column in range(4)]
     tops = [HEAD + k * (CAPTION + h) + CAPTION for k in range(len(rows))]
     width, height = lefts[-1] + w + GAP, tops[-1] + h + GAP
-    figure = new_figure(width / 100, height / 100, dpi=100, layout="none")
-
-    def write(x: float, y: float, text: str, **style: Any) -> None:  # pixels from the top left
-        figure.text(x / width, 1 - y / height, text, fontsize=9, va="center", **style)
-
+    sheet = np.full((height, width, 3), 255, np.uint8)
     titles = ("truth", "render", f"error, 0 to {LARGEST_ERROR}", f"depth, {near:.2f} to {far:.2f} m")
     for column, title in enumerate(titles):
-        write(lefts[column] + (w // 4 + 8 if column > 1 else 0), HEAD / 2, title)
-    for row, top in zip(rows, tops):
-        write(GAP, top - CAPTION / 2, row.caption, fontweight="bold")
-        if row.truth is None:
-            for column in (0, 2):
-                write(lefts[column] + w / 2, top + h / 2, "no truth", ha="center")
-    # Panels are put in after the text is drawn, pixel by pixel: matplotlib would resample them.
-    sheet = _drawn(figure)
-    for row_panels, top in zip(panels, tops):
+        _write_text(sheet, lefts[column] + (w // 4 + 8 if column > 1 else 0), HEAD // 2, title)
+    for row, row_panels, top in zip(rows, panels, tops):
+        _write_text(sheet, GAP, top - CAPTION // 2, row.caption)
         for panel, left in zip(row_panels, lefts):
-            if panel is not None:
-                sheet[top : top + h, left : left + w] = _bytes(panel)
+            if panel is None:
+                _write_text(sheet, left + w // 2 - 4 * LETTER, top + h // 2, "no truth")
+            else:
+                sheet[top : top + h, left : left + w] = panel
     scale = np.linspace(0, 1, w // 4)[None].repeat(8, 0)
-    for left, name in ((lefts[2], "magma"), (lefts[3], "viridis")):
-        sheet[HEAD // 2 - 4 : HEAD // 2 + 4, left : left + w // 4] = _bytes(_coloured(scale, name))
+    for left, colours in ((lefts[2], cv2.COLORMAP_MAGMA), (lefts[3], cv2.COLORMAP_VIRIDIS)):
+        sheet[HEAD // 2 - 4 : HEAD // 2 + 4, left : left + w // 4] = _coloured(scale, colours)
     _write_png(path, sheet)
 
 
+def _write_text(picture: np.ndarray, x: int, y: int, text: str) -> None:
+    """Write dark letters into a picture [H, W, 3], from x on and centred at y (pixels)."""
+    base = (x, y + LETTER // 2)
+    cv2.putText(picture, text, base, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+
+
 def _panels(row: PictureRow, near: float, far: float) -> list[np.ndarray | None]:  # 4 of [H, W, 3]
-    render = np.clip(row.render, 0, 1)
     truth = error = None
     if row.truth is not None:
         truth = _grey(row.truth)
-        error = _coloured(np.abs(render - row.truth) / LARGEST_ERROR, "magma")
-    return [truth, _grey(render), error, depth_colours(row.depth, near, far)]
+        difference = np.abs(np.clip(row.render, 0, 1) - row.truth)
+        error = _coloured(difference / LARGEST_ERROR, cv2.COLORMAP_MAGMA)
+    return [truth, _grey(row.render), error, depth_colours(row.depth, near, far)]
 
 
-def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:  # [H, W] -> [H, W, 3]
+def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:  # [H, W] -> [H, W, 3] uint8
     """Return depth (metres) in colours from dark (near) to bright (far), white where there is none."""
-    colours = _coloured((depth - near) / max(far - near, 1e-3), "viridis")
-    colours[depth <= 0] = 1.0
+    colours = _coloured((depth - near) / max(far - near, 1e-3), cv2.COLORMAP_VIRIDIS)
+    colours[depth <= 0] = 255
     return colours
 
 
@@ -101,18 +100,16 @@ def _depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:  # metres
     return float(near), float(far)
 
 
-def _coloured(values: np.ndarray, name: str) -> np.ndarray:  # [H, W] in [0, 1] -> [H, W, 3]
-    from matplotlib import colormaps
-
-    return np.asarray(colormaps[name](np.clip(values, 0, 1))[..., :3])
+def _coloured(values: np.ndarray, colours: int) -> np.ndarray:  # [H, W] in [0, 1] -> [H, W, 3] uint8
+    return np.asarray(cv2.applyColorMap(_bytes(values), colours))[..., ::-1]
 
 
-def _bytes(image: np.ndarray) -> np.ndarray:  # in [0, 1] -> uint8
-    return np.rint(255 * image).astype(np.uint8)
+def _bytes(image: np.ndarray) -> np.ndarray:  # -> uint8; what lies outside [0, 1] is clipped
+    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
 
 
-def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H, W, 3]
-    return np.repeat(image.astype(np.float64)[..., None], 3, axis=-1)
+def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H, W, 3] uint8
+    return np.repeat(_bytes(image)[..., None], 3, axis=-1)
 
 
 def _panel_size(shape: tuple[int, ...], panel_width: int) -> tuple[int, int]:
@@ -160,17 +157,17 @@ def smooth_path(
 
 def fly_through_frames(
     views: Iterable[tuple[np.ndarray, np.ndarray]],  # brightness and depth [H, W] of every frame
-) -> Iterator[np.ndarray]:  # [H, 2 W, 3] in [0, 1]
+) -> Iterator[np.ndarray]:  # [H, 2 W, 3] uint8
     """Yield render and depth side by side; the first frame sets the depth's colours."""
     near = far = 0.0
     for intensity, depth in views:
         if far == 0.0 and (depth > 0).any():
             near, far = _depth_range([depth])
-        yield np.concatenate([_grey(np.clip(intensity, 0, 1)), depth_colours(depth, near, far)], 1)
+        yield np.concatenate([_grey(intensity), depth_colours(depth, near, far)], 1)
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write frames ([H, W, 3] RGB in [0, 1]) as MPEG-4; odd edges are cut off, the format has even sizes."""
+    """Write frames ([H, W, 3] RGB, uint8) as MPEG-4; odd edges are cut off, the format has even sizes."""
     writer = None
     with atomic_file(path) as temporary:
         for frame in frames:
@@ -180,7 +177,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
                 writer = cv2.VideoWriter(str(temporary), code, fps, (w, h))
                 if not writer.isOpened():
                     raise NoEncoderError(f"{path.name}: OpenCV cannot write MPEG-4 here; no video is made")
-            writer.write(_bytes(frame[:h, :w, ::-1]))
+            writer.write(np.ascontiguousarray(frame[:h, :w, ::-1]))
         if writer is None:
             raise DataError(f"{path.name}: expected at least one frame, got none")
         writer.release()
@@ -189,11 +186,11 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 # ---------------------------------------------------------------- matplotlib without global state
 
 
-def new_figure(width: float, height: float, dpi: int = 120, layout: Any = "constrained") -> "Figure":
+def new_figure(width: float, height: float, dpi: int = 120) -> "Figure":
     """Return a figure (inches) that belongs to nobody: no pyplot, so no display and no leak."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), dpi=dpi, layout=layout)
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

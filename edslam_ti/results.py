@@ -292,7 +292,7 @@ def _rendered(state: Run, kind: str) -> Iterator[_RenderedView]:
         seen = np.flatnonzero(state.samples.has_depth[: len(slam.trajectory)])
         indices = [int(k) for k in seen if k not in state.held_out]
     for k in (indices[j] for j in _evenly(len(indices), most)):
-        sample = state.samples[k]
+        sample = state.samples.without_events(k)
         view = slam.mapper.render(camera, slam.trajectory.pose(k))
         yield _RenderedView(kind, sample.timestamp, sample.image, sample.depth, view)
 

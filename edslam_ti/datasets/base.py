@@ -3,7 +3,7 @@
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -137,14 +137,19 @@ class SampledSequence:
         return (self[k] for k in range(len(self)))
 
     def __getitem__(self, k: int) -> Sample:
+        sample = self.without_events(k)
+        # The first sample gets a little history so that its time surface is not empty.
+        previous = float(self.timestamps[k - 1]) if k else sample.timestamp - 0.1
+        return replace(sample, events=self.sequence.events(previous, sample.timestamp))
+
+    def without_events(self, k: int) -> Sample:
+        """Return sample k with no events: what it is compared with."""
         if not 0 <= k < len(self):
             raise IndexError(k)
         t = float(self.timestamps[k])
-        # The first sample gets a little history so that its time surface is not empty.
-        previous = float(self.timestamps[k - 1]) if k else t - 0.1
         return Sample(
             timestamp=t,
-            events=self.sequence.events(previous, t),
+            events=Events.empty(),
             depth=self.sequence.depth(int(self._depth_index[k])) if self.has_depth[k] else None,
             image=self.sequence.image_at(t),
             T_world_camera=self.sequence.true_pose(t),
