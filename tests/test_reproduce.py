@@ -16,7 +16,7 @@ from edslam_ti.baselines import METHODS
 from edslam_ti.camera import Camera
 from edslam_ti.command_line import UsageError
 from edslam_ti.config import Config
-from edslam_ti.datasets import EventDepthSequence
+from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import ConfigError, DataError
 from edslam_ti.reproduce import runs
@@ -26,12 +26,12 @@ from edslam_ti.reproduce.ablations import (
     ablation_rows,
     ablation_variants,
 )
-from edslam_ti.reproduce.altered import AlteredSequence
+from edslam_ti.reproduce.altered import AlteredSequence, RepeatedSequence
 from edslam_ti.reproduce.cases import Case, Recording, Selection, all_cases, quick_cases
 from edslam_ti.reproduce.recordings import Recordings
 from edslam_ti.reproduce.report import insert_into, markdown, write_report
 from edslam_ti.reproduce.runs import Variant, methods_as_variants, result_file, run_all
-from edslam_ti.simulation import HandHeldPath
+from edslam_ti.simulation import HandHeldPath, make_path, simulate
 from edslam_ti.simulation.depth_noise import viewing_cosine
 from edslam_ti.simulation.renderer import Renderer
 
@@ -74,6 +74,28 @@ def test_altered_sequence_thins_depth_and_cuts_gaps(tiny_sequence: EventDepthSeq
     np.testing.assert_array_equal(cut.t, whole.t[kept])
     assert len(gap.events(0.22, 0.28)) == 0
     assert len(gap.events(0.15, 0.18)) == len(tiny_sequence.events(0.15, 0.18))
+
+
+def test_a_loop_is_played_again_where_it_ended(tmp_path: Path) -> None:
+    settings = TINY.model_copy(update={"path": "loop", "duration": 0.4})
+    room = tiny_room()
+    simulate(room.scene, make_path(room, settings), settings, tmp_path / "loop")
+    once = EventReplicaSequence(tmp_path / "loop")
+    twice = RepeatedSequence(once, 2)
+    stamps = once.depth_timestamps
+    np.testing.assert_allclose(twice.depth_timestamps, [*stamps, *(stamps[1:] + 0.4)])
+    np.testing.assert_array_equal(twice.depth(len(stamps)), once.depth(1))
+    assert twice.truth is not None
+    np.testing.assert_allclose(twice.truth.at(0.5), twice.truth.at(0.1), atol=1e-9)
+    across = twice.events(0.35, 0.45)
+    assert len(across) == len(once.events(0.35, 0.4)) + len(once.events(0.0, 0.05))
+    assert (np.diff(across.t) >= 0).all()
+    assert len(SampledSequence(twice, 0.0, None, 0.05)) == 2 * len(SampledSequence(once, 0.0, None, 0.05))
+
+
+def test_a_path_that_does_not_close_is_not_played_again(tiny_sequence: EventDepthSequence) -> None:
+    with pytest.raises(DataError, match="end where they begin"):
+        RepeatedSequence(tiny_sequence, 2)
 
 
 def test_altered_depth_is_noisy_and_the_same_every_time(tiny_sequence: EventDepthSequence) -> None:

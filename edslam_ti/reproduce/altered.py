@@ -1,13 +1,17 @@
 """A recording as a worse sensor would have made it: noisy or sparser depth, stretches without data."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 from edslam_ti.simulation.depth_noise import kinect_depth, viewing_cosine
+from edslam_ti.trajectory import Trajectory
 
 Gap = tuple[float, float]  # seconds from the sequence's clock, start and length
+SAME_POSE = 1e-3  # metres, entries of rotation matrices
 
 
 class AlteredSequence(EventDepthSequence):
@@ -74,6 +78,56 @@ class AlteredSequence(EventDepthSequence):
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
         return self._sequence.image(index)
+
+
+class RepeatedSequence(EventDepthSequence):
+    """A recording that ends where it began, played several times on end: as long a stream as is wanted."""
+
+    def __init__(self, sequence: EventDepthSequence, rounds: int) -> None:
+        truth = sequence.truth
+        apart = np.inf if truth is None else np.abs(truth.pose(-1) - truth.pose(0)).max()
+        if truth is None or apart > SAME_POSE:
+            raise DataError(
+                f"{sequence.scene}: expected true poses that end where they begin, to play it again, got "
+                f"{'none' if truth is None else f'a difference of {apart:.3g}'}; record a loop (--path loop)"
+            )
+        self._sequence = sequence
+        self._period = float(truth.timestamps[-1] - truth.timestamps[0])
+        self.dataset, self.scene, self.camera = sequence.dataset, sequence.scene, sequence.camera
+        self.contrast_threshold = sequence.contrast_threshold
+        self.description = f"{sequence.description}, {rounds} times on end"
+        self._rounds = rounds
+        self.depth_timestamps, self._depth = self._repeated(sequence.depth_timestamps)
+        self.image_timestamps, self._image = self._repeated(sequence.image_timestamps)
+        stamps, index = self._repeated(truth.timestamps)
+        self.truth = Trajectory(stamps, truth.poses[index])
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        first, last = self._sequence.time_range
+        return first, last + (self._rounds - 1) * self._period
+
+    def events(self, start: float, end: float) -> Events:
+        parts = []
+        for k in range(self._rounds):
+            shift, is_last = k * self._period, k == self._rounds - 1
+            until = end - shift if is_last else min(end - shift, self._period)
+            part = self._sequence.events(max(start - shift, 0.0) if k else start, until)
+            parts.append(replace(part, t=part.t + shift))
+        return Events.concatenate(parts)
+
+    def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+        return self._sequence.depth(int(self._depth[index]))
+
+    def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
+        return self._sequence.image(int(self._image[index]))
+
+    def _repeated(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [N] s -> [M] s, [M] indices
+        """Return the stamps of all rounds, and which of the recording's each is."""
+        times = np.concatenate([stamps + k * self._period for k in range(self._rounds)])
+        indices = np.tile(np.arange(len(stamps)), self._rounds)
+        is_new = np.diff(times, prepend=-np.inf) > 1e-6  # a round begins with the last one's end
+        return times[is_new], indices[is_new]
 
 
 def _thinned(stamps: np.ndarray, rate: float | None) -> np.ndarray:  # [D] s -> indices

@@ -90,7 +90,8 @@ def ablations(
 def long_stream(
     recording: Path | None = None,
     scene: str = "office0",
-    duration: float = 60.0,
+    duration: float = 30.0,
+    rounds: int = 2,
     width: int = 384,
     height: int = 240,
     config: Path | None = None,
@@ -102,8 +103,9 @@ def long_stream(
 
     Args:
         recording: folder in EventReplica's layout; omitted: the loop through a built-in room
-        scene: built-in room; 60 s of office0 take 8 GB at full size
-        duration: seconds
+        scene: built-in room; 30 s of office0 take 4 GB at full size
+        duration: seconds of the made recording
+        rounds: how often a recording that ends where it began is played
         width: of the made recording, pixels
         height: of the made recording, pixels
         config: YAML file with settings that differ from the defaults
@@ -113,20 +115,22 @@ def long_stream(
     """
     import kernels
     from edslam_ti.config import Config, read_differences
+    from edslam_ti.datasets import EventDepthSequence
     from edslam_ti.datasets.builtin import builtin_sequence_folder
     from edslam_ti.datasets.event_replica import EventReplicaSequence
+    from edslam_ti.reproduce.altered import RepeatedSequence
+    from edslam_ti.reproduce.cases import Recording
     from edslam_ti.reproduce.long_stream import measure
-    from edslam_ti.simulation import SimulationConfig
 
     kernels.init("cpu", threads=threads)
     if recording is None:
-        made = SimulationConfig(
-            path="loop", duration=duration, width=width, height=height, compact_events=True
-        )
-        recording = builtin_sequence_folder(scene, made)
-    settings = Config(duration=duration, threads=threads)
-    settings = settings.updated({} if config is None else read_differences(config))
-    measure(EventReplicaSequence(recording), settings, out, length, print)
+        loop = Recording(scene, "loop", duration=duration).settings
+        recording = builtin_sequence_folder(scene, loop.model_copy(update={"width": width, "height": height}))
+    sequence: EventDepthSequence = EventReplicaSequence(recording)
+    if rounds > 1:
+        sequence = RepeatedSequence(sequence, rounds)
+    settings = Config(threads=threads).updated({} if config is None else read_differences(config))
+    measure(sequence, settings, out, length, print)
     print((out / "long_stream.md").read_text())
 
 
