@@ -1,6 +1,12 @@
 """Taichi kernels of ED-SLAM and their torch wrappers; knows arrays, not SLAM."""
 
-from kernels.runtime import init
+import gc
+
+try:
+    gc.disable()  # importing torch would look 380 times for garbage among what it has just made
+    from kernels.runtime import init
+finally:
+    gc.enable()
 
 __project__ = "edslam_ti"  # `kernels` is also the name of an unrelated PyPI package
 

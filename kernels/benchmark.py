@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from kernels import reference
+from kernels import brightness_image, patch_warp, reference
+from kernels import time_surface as surfaces
 from kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from kernels.patch_warp import (
     NEAR,
@@ -32,7 +33,6 @@ from kernels.patch_warp import (
     Patches,
     ResidualModel,
     adjoint,
-    compile_kernels,
     extract_patches,
 )
 from kernels.projection import MIN_ALPHA
@@ -471,7 +471,8 @@ def run_every_kernel() -> None:
     scene = [x.detach() for x in inputs[:-1]]
     compare_change(*scene, poses, intrinsics, (16, 12), target, 0.5, 0.01, 1.0)
     compare_view(*scene, poses[0], intrinsics, (16, 12), target, target, 0.5, 0.01, 1.0, 1.0)
-    compile_kernels()
+    for module in (patch_warp, brightness_image, surfaces):
+        module.compile_kernels()
     x, t = np.zeros(MANY_EVENTS, np.int16), np.zeros(MANY_EVENTS)
     update_last_timestamps(x, x, t, np.zeros((1, 1)))
     accumulate_polarity(x[:1], x[:1], np.ones(1, np.int8), np.array([0, 1]), (1, 1))

@@ -5,11 +5,14 @@ import contextlib
 import functools
 import io
 import os
+import textwrap
+import types
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 import numpy as np
 import taichi as ti
+import taichi.lang.expr
 import taichi.lang.matrix_ops  # Taichi's first vector would import it, eight times as slowly by then
 import torch
 from taichi.lang import kernel_impl
@@ -24,10 +27,14 @@ def _place_in_source(self: ASTTransformerContext, node: ast.expr | ast.stmt) -> 
     return f'File "{self.file}", line {line}, in {self.func.func.__name__}:\n{self.src[node.lineno - 1]}\n'
 
 
-# Until a kernel first runs, Taichi spent more than half the time on wording this for every expression, and on
-# finding the source of functions once for each of their uses.
+# Until a kernel first runs, Taichi spent more than half the time on wording this for every expression and on
+# finding, and wrapping, the source of functions once for each of their uses; it asked numpy for the range of
+# integers at every literal, and looked through all modules to see whether a function is a method (none is).
 ASTTransformerContext.get_pos_info = _place_in_source
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+kernel_impl.textwrap = types.SimpleNamespace(dedent=textwrap.dedent, fill=functools.cache(textwrap.fill))
+taichi.lang.expr.np = types.SimpleNamespace(**vars(np) | {"iinfo": functools.cache(np.iinfo)})
+kernel_impl._inside_class = lambda level_of_class_stackframe: False
 # At every launch, Taichi asked anew for each array whether torch is there and what its dtype is called.
 kernel_impl.has_pytorch = functools.cache(kernel_impl.has_pytorch)
 kernel_impl.to_taichi_type = functools.cache(kernel_impl.to_taichi_type)

@@ -3,18 +3,22 @@
 T(x, t) = exp(-(t - t_last(x)) / tau),    E(x) / C = sum of p_i over the events at x in an interval
 """
 
+import functools
+
 import numpy as np
 import taichi as ti
 
 from kernels.runtime import CHUNK, check_shape, workers
 
 MANY_EVENTS = 1_000_000  # below this numpy is done before a second core has woken up
+PACKED = 4  # int16 to a 64-bit word
+EVEN = 0x0000FFFF0000FFFF  # bits of the first and the third
 
 
 @ti.kernel
 def _newest_events(
-    x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
-    y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
+    x: ti.types.ndarray(ti.i64, ndim=1),  # [N / 4] four int16 each, none negative
+    y: ti.types.ndarray(ti.i64, ndim=1),  # [N / 4]
     polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N], any if not by polarity
     height: ti.i32,
     width: ti.i32,
@@ -24,18 +28,24 @@ def _newest_events(
 ):
     # Parallel stores to one image race and atomics are slow: each worker has a part of the time and an
     # image of its own, of indices, because those are half as long as times and need not be read.
-    num_pixels = newest.shape[0] // num_workers
+    num_pixels, words = newest.shape[0] // num_workers, ti.cast(x.shape[0], ti.i64)
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
-            w, n = chunk // CHUNK, ti.cast(x.shape[0], ti.i64)
+            w = chunk // CHUNK
             own = w * num_pixels
-            for i in range(
-                ti.cast(n * w // num_workers, ti.i32), ti.cast(n * (w + 1) // num_workers, ti.i32)
+            for word in range(
+                ti.cast(words * w // num_workers, ti.i32), ti.cast(words * (w + 1) // num_workers, ti.i32)
             ):
-                row = ti.cast(y[i], ti.i32)
-                if ti.static(by_polarity):
-                    row += ti.select(polarity[i] > 0, height, 0)
-                newest[own + row * width + ti.cast(x[i], ti.i32)] = i
+                # Two pixels, y * width + x, in one product: either half of a number is one of them.
+                even = (y[word] & ti.i64(EVEN)) * width + (x[word] & ti.i64(EVEN))
+                odd = (y[word] >> 16 & ti.i64(EVEN)) * width + (x[word] >> 16 & ti.i64(EVEN))
+                pixels = [even, odd, even >> 32, odd >> 32]
+                for k in ti.static(range(PACKED)):
+                    i = word * PACKED + k
+                    pixel = own + ti.cast(pixels[k], ti.i32)
+                    if ti.static(by_polarity):
+                        pixel += ti.select(polarity[i] > 0, height * width, 0)
+                    newest[pixel] = i
 
 
 @ti.kernel
@@ -102,12 +112,25 @@ def update_last_timestamps(
         if polarity is not None:
             pixels += (polarity > 0) * (height * width)
         flat[pixels] = t  # of several events at a pixel numpy keeps the last
-    else:
-        newest = np.full(workers() * flat.size, -1, np.int32)
-        signs = np.empty(0, np.int8) if polarity is None else polarity
-        _newest_events(x, y, signs, height, width, workers(), newest, polarity is not None)
-        event = newest.reshape(workers(), -1).max(0)
-        np.copyto(flat, t.take(event, mode="clip"), where=event >= 0)
+        return
+    newest = _memory(workers() * flat.size)
+    newest.fill(-1)
+    words = len(x) // PACKED
+    packed = [np.ascontiguousarray(array[: words * PACKED]).view(np.int64) for array in (x, y)]
+    signs = np.empty(0, np.int8) if polarity is None else polarity
+    _newest_events(*packed, signs, height, width, workers(), newest, polarity is not None)
+    event = newest.reshape(workers(), -1).max(0)
+    np.copyto(flat, t.take(event, mode="clip"), where=event >= 0)
+    if rest := len(x) % PACKED:
+        update_last_timestamps(
+            x[-rest:], y[-rest:], t[-rest:], last, None if polarity is None else polarity[-rest:]
+        )
+
+
+@functools.lru_cache(maxsize=1)
+def _memory(size: int) -> np.ndarray:
+    """Return memory that is kept: the pages of a fresh array cost more than to fill it."""
+    return np.empty(size, np.int32)
 
 
 def time_surface(

@@ -26,7 +26,7 @@ from kernels.compositing import (
     list_blocks,
     log_255_alpha,
 )
-from kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions
+from kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions, zeros
 from kernels.projection import (
     BLOCK,
     FEATURES,
@@ -78,7 +78,7 @@ def composite(
 def differentiate_block(
     record: ti.template(), items: ti.template(), space, block, number, x, y, kept: ti.template(),
     grad_intensity, grad_depth, background,
-    near_grad: ti.template(), has_depth: ti.template(),
+    near_grad: ti.template(),
 ):  # fmt: skip
     """Add to the gradients of the records; see `kernels.rasterization.draw_backward`."""
     behind = background * grad_intensity
@@ -86,9 +86,7 @@ def differentiate_block(
         n = number - 1 - from_end
         at = space * items.shape[2] + items[space, block, n]
         alpha, weight = kept[space, n, ALPHA], kept[space, n, WEIGHT]
-        q = record[at, FEATURES + 1] * grad_intensity - behind
-        if ti.static(has_depth):
-            q += record[at, FEATURES] * grad_depth
+        q = record[at, FEATURES] * grad_depth + record[at, FEATURES + 1] * grad_intensity - behind
         behind += alpha * q
         v = ti.select(alpha < MAX_ALPHA, weight * q, 0.0)  # min() passes no gradient where it cuts
         dx, dy = x - record[at, MEAN_X], y - record[at, MEAN_Y]
@@ -112,7 +110,7 @@ def _compare_views(
     background: float,
     epsilon: float,
     target: lanes(1),  # [blocks] log brightness, or its change between two views
-    target_depth: lanes(1),  # [blocks] metres, 0 = missing; not read where there are two views
+    target_depth: lanes(1),  # [blocks] metres, 0 = missing
     scale: float,  # s, s_e
     depth_scale: float,  # s_d
     next_tile: ti.types.ndarray(ti.i32, ndim=1),  # [1] queue of tiles, starts at 0
@@ -123,11 +121,12 @@ def _compare_views(
     number: ti.types.ndarray(ti.i32, ndim=2),  # [workers * V, blocks of a tile]
     items: ti.types.ndarray(ti.i32, ndim=3),  # [workers * V, blocks of a tile, longest]
     kept: lanes(3),  # [workers * V, longest, 2]
+    brightness: lanes(1),  # [workers * V]
     # outputs
     difference: lanes(1),  # [blocks] rendered minus target
     tile_losses: ti.types.ndarray(ndim=2),  # [tiles, 2] sums of squares, and of depth errors
     slot_grad: sums(2),  # [P, 1]
-    V: ti.template(),
+    V: ti.i32,
 ):
     columns, across, tiles = (width + tile - 1) // tile, tile // BLOCK, tile_losses.shape[0]
     longest = items.shape[2]
@@ -150,47 +149,28 @@ def _compare_views(
                     y = (row + block // across) * BLOCK + lane_rows()
                     is_inside = (x < width) & (y < height)
                     i, space = t * across * across + block, w * V
-                    T, intensity, depth = composite(
-                        near_record, items, space, block, number[space, block], x, y, is_inside, kept
-                    )
-                    value = intensity + T * background + epsilon
-                    if ti.static(V == 2):
-                        T_end, intensity_end, _ = composite(
-                            near_record,
-                            items,
-                            space + 1,
-                            block,
-                            number[space + 1, block],
-                            x,
-                            y,
-                            is_inside,
+                    depth_error = zeros()
+                    for v in range(V):
+                        T, intensity, depth = composite(
+                            near_record, items, space + v, block, number[space + v, block], x, y, is_inside,
                             kept,
-                        )
-                        value_end = intensity_end + T_end * background + epsilon
-                        r = ti.select(is_inside, log(value_end / value) - target[i], 0.0)
-                        difference[i] = r
-                        squares += (r * r).sum()
-                        slope = 2.0 * scale * r
-                        zero = r * 0.0
-                        differentiate_block(
-                            near_record, items, space, block, number[space, block], x, y, kept,
-                            (0.0 - slope) / value, zero, background, near_grad, False,
                         )  # fmt: skip
+                        brightness[space + v] = intensity + T * background + epsilon
+                        depth_error = depth - target_depth[i]
+                    ratio = brightness[space + V - 1]
+                    if V == 2:
+                        ratio = ratio / brightness[space]
+                    r = ti.select(is_inside, log(ratio) - target[i], 0.0)
+                    difference[i] = r
+                    squares += (r * r).sum()
+                    sign = ti.select(depth_error > 0.0, 1.0, -1.0)
+                    sign = ti.select(is_inside & (target_depth[i] > 0.0), sign, 0.0)
+                    errors += (depth_error * sign).sum()
+                    for v in range(V):
+                        slope = ti.select(v == V - 1, 2.0 * scale, -2.0 * scale) * r
                         differentiate_block(
-                            near_record, items, space + 1, block, number[space + 1, block], x, y, kept,
-                            slope / value_end, zero, background, near_grad, False,
-                        )  # fmt: skip
-                    else:
-                        r = ti.select(is_inside, log(value) - target[i], 0.0)
-                        difference[i] = r
-                        squares += (r * r).sum()
-                        error = depth - target_depth[i]
-                        sign = ti.select(error > 0.0, 1.0, -1.0)
-                        sign = ti.select(is_inside & (target_depth[i] > 0.0), sign, 0.0)
-                        errors += (error * sign).sum()
-                        differentiate_block(
-                            near_record, items, space, block, number[space, block], x, y, kept,
-                            2.0 * scale * r / value, depth_scale * sign, background, near_grad, True,
+                            near_record, items, space + v, block, number[space + v, block], x, y, kept,
+                            slope / brightness[space + v], depth_scale * sign, background, near_grad,
                         )  # fmt: skip
                 tile_losses[t, 0], tile_losses[t, 1] = squares, errors
                 for v in range(V):
@@ -229,7 +209,8 @@ class _CompareViews(torch.autograd.Function):
             by_sums(record), lists.start, lists.pairs, *size, tile, background, epsilon,
             targets[0], targets[1], *weights, torch.zeros(1, dtype=torch.int32),
             by_sums(space.near), space.near, by_sums(space.near_grad), space.number, space.items,
-            record.new_empty(space.items.shape[0], space.items.shape[2], 2, LANES),
+            record.new_empty(len(space.items), space.items.shape[2], 2, LANES),
+            record.new_empty(len(space.items), LANES),
             difference, losses, by_sums(slot_grad), num_views,
         )  # fmt: skip
         ctx.gradients, ctx.grad_poses = project_backward(projection, slot_grad)
