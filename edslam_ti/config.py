@@ -175,7 +175,9 @@ class Config(Stage):
     poses: Literal["tracked", "truth"] = "tracked"
     """truth: skip tracking and map with the true poses."""
     contrast_threshold: float | None = Field(None, gt=0)
-    """C in Eq. 11; omitted: the data set's own (camera.json), else estimated from its images, else 0.1."""
+    """C in Eq. 11; omitted: the data set's own (camera.json), else estimated from its images, else 0.1,
+    for events alone do not fix it (log brightness is then known up to a factor). Given: the mean of C+
+    and C-, whose ratio is estimated from the images, if there are any."""
     max_interval: float = Field(0.05, gt=0)
     """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
     out: Path = Path("results")

@@ -2,39 +2,46 @@
 
 Events alone do not fix it: multiply all log brightness and C by one factor, and the same events come out
 (maps, renders and poses are then right up to that factor, which a fit of slope and offset in log brightness
-takes away). A few grey images do: between two of them, a pixel whose brightness only rises by y fires
+takes away). A few grey images do: between two of them, log brightness at every pixel changes by
 
-    n = y / C + b,     b between -1 and 0, for what was left over of the last event
+    y = C+ p - C- n + error        p, n: positive and negative events in between
 
-events, so that C is one over the slope of n against y (not the inverse, whose slope the noise of n biases).
+Both sides are noisy: p and n by what was left over of the last event and by events of the sensor's own
+making, y by the images' noise. Least squares of y against p, n gives too small a C, of p, n against y too
+large a one. So p and n of the pixels around, whose noise is not this pixel's, stand in as instruments Z
+(Wald 1940): (C+, C-) = (Z^T X)^-1 Z^T y with X = [p, -n]. Without a constant term: a scene as a whole does
+not become brighter, which fixes C+ / C- where a sensor fires by itself.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
+import cv2
 import numpy as np
 
 from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.events import Events
 
 DEFAULT = 0.1  # Sec. IV-A: 0.1 synthetic, 0.2 real
-MAX_PAIRS = 12  # of consecutive images
-LONGEST_PAIR = 0.2  # seconds between the two
+GAPS = (1, 2, 4)  # images between the two of a pair
+MAX_PAIRS = 8  # of each gap
+LONGEST_PAIR = 0.3  # seconds between the two
 DARKEST, BRIGHTEST = 0.1, 0.98  # grey values that are neither lost in 8 bits nor clipped
-MIN_CHANGE = 0.25  # log brightness
-MIN_PIXELS = 200  # of either polarity
-OUTLIER = 3.0  # standard deviations
+MIN_EVENTS = 400  # of either polarity
+LEAN = 0.25  # thresholds that brightness is beyond the last event, in its direction, on average
+HISTORY = 0.3  # seconds before a pair in which the last event of a pixel is looked for
 LOG_EPSILON = 0.004
+RING = 5  # px; pixels of this square around a pixel, without the inner 3 x 3, are its instruments
 
 
 @dataclass(frozen=True)
 class ContrastThreshold:
-    """C and where it comes from; standard deviations are of the fit."""
+    """C and where it comes from."""
 
     value: float
     source: str  # "settings", "data", "images" or "default"
     positive: float | None = None
     negative: float | None = None
-    deviation: float | None = None  # of `value`; systematic errors are larger, 2 % in simulated rooms
+    deviation: float | None = None  # standard deviation of `value` among the pairs of images (jackknife)
 
     @property
     def relative(self) -> tuple[float, float]:
@@ -50,12 +57,17 @@ def contrast_threshold(
     start: float,  # seconds
     end: float,
 ) -> ContrastThreshold:
-    """Return the threshold that the settings or the data state, else an estimate, else the default."""
-    if stated is not None:
-        return ContrastThreshold(stated, "settings")
-    if sequence.contrast_threshold is not None:
+    """Return the threshold that the settings or the data state, else an estimate, else the default.
+
+    What the settings state is the mean: how positive and negative events differ is estimated all the same.
+    """
+    if sequence.contrast_threshold is not None and stated is None:
         return ContrastThreshold(sequence.contrast_threshold, "data")
-    return contrast_from_images(sequence, start, end) or ContrastThreshold(DEFAULT, "default")
+    estimate = contrast_from_images(sequence, start, end)
+    if stated is not None:
+        positive, negative = (stated * r for r in estimate.relative) if estimate else (None, None)
+        return ContrastThreshold(stated, "settings", positive, negative)
+    return estimate or ContrastThreshold(DEFAULT, "default")
 
 
 def contrast_from_images(
@@ -66,42 +78,68 @@ def contrast_from_images(
     """Return the threshold by brightness changes between images inside [start, end], None without enough."""
     stamps = sequence.image_timestamps
     inside = np.nonzero((stamps >= start) & (stamps <= end))[0]
-    pairs = [(a, b) for a, b in pairwise(inside) if stamps[b] - stamps[a] <= LONGEST_PAIR]
-    step = max(1, len(pairs) // MAX_PAIRS)
-    changes, counts = [np.empty(0)], [np.empty(0)]
-    for a, b in pairs[::step][:MAX_PAIRS]:
-        before, after = sequence.image(int(a)), sequence.image(int(b))
-        events = sequence.events(float(stamps[a]), float(stamps[b]))
-        count, total = np.zeros(before.shape), np.zeros(before.shape)
-        np.add.at(count, (events.y, events.x), events.polarity.astype(float))
-        np.add.at(total, (events.y, events.x), 1.0)
-        usable = np.abs(count) == total  # the change had one direction
-        for image in (before, after):
-            usable &= (image > DARKEST) & (image < BRIGHTEST)
-        changes.append(np.log((after[usable] + LOG_EPSILON) / (before[usable] + LOG_EPSILON)))
-        counts.append(count[usable])
-    change, count = np.concatenate(changes), np.concatenate(counts)
-    fits = [_fit(sign * change, sign * count) for sign in (1, -1)]
-    if any(fit is None for fit in fits):
+    products = []
+    for gap in GAPS:
+        pairs = [(a, b) for a, b in zip(inside, inside[gap:]) if stamps[b] - stamps[a] <= LONGEST_PAIR]
+        step = max(1, len(pairs) // MAX_PAIRS)
+        products += [_products(sequence, int(a), int(b)) for a, b in pairs[::step][:MAX_PAIRS]]
+    if len(products) < 2 or np.sum([p.events for p in products], 0).min() < MIN_EVENTS:
         return None
-    (positive, d_positive), (negative, d_negative) = (fit for fit in fits if fit is not None)
-    mean, deviation = 0.5 * (positive + negative), 0.5 * float(np.hypot(d_positive, d_negative))
-    return ContrastThreshold(mean, "images", positive, negative, deviation)
+    M, v = (
+        np.array([p.instruments_events for p in products]),
+        np.array([p.instruments_change for p in products]),
+    )
+    estimate = _solved(M.sum(0), v.sum(0))
+    without_one = np.array([_solved(M.sum(0) - m, v.sum(0) - w) for m, w in zip(M, v)])
+    if not (np.isfinite(without_one).all() and (estimate > 0).all()):
+        return None
+    n, means = len(products), without_one.mean(1)
+    deviation = float(np.sqrt((n - 1) * means.var()))
+    positive, negative = (float(c) for c in estimate)
+    return ContrastThreshold(0.5 * (positive + negative), "images", positive, negative, deviation)
 
 
-def _fit(change: np.ndarray, count: np.ndarray) -> tuple[float, float] | None:
-    """Return C and its standard deviation from changes of one sign, None with too few pixels."""
-    kept = change > MIN_CHANGE
-    y, n = change[kept], count[kept]
-    for _ in range(3):
-        if len(y) < MIN_PIXELS:
-            return None
-        slope, offset = np.polyfit(y, n, 1)
-        residual = n - slope * y - offset
-        deviation = residual.std()
-        kept = np.abs(residual) <= OUTLIER * deviation
-        y, n = y[kept], n[kept]
-    if slope <= 0:
-        return None
-    slope_deviation = deviation / (y.std() * np.sqrt(len(y)))
-    return float(1 / slope), float(slope_deviation / slope**2)
+@dataclass(frozen=True)
+class _Products:
+    """Sums over the pixels of a pair of images."""
+
+    instruments_events: np.ndarray  # [2, 2] Z^T X
+    instruments_change: np.ndarray  # [2] Z^T y
+    events: np.ndarray  # [2] positive and negative ones
+
+
+def _products(sequence: EventDepthSequence, first: int, second: int) -> _Products:
+    before, after = sequence.image(first), sequence.image(second)
+    start, end = (float(sequence.image_timestamps[k]) for k in (first, second))
+    regressors = _regressors(sequence.events(start - HISTORY, end), start, before.shape)
+    square = (cv2.boxFilter(r, -1, (RING, RING), normalize=False) for r in regressors)
+    around = [s - cv2.boxFilter(r, -1, (3, 3), normalize=False) for s, r in zip(square, regressors)]
+    usable = np.ones(before.shape, bool)
+    for image in (before, after):
+        usable &= (image > DARKEST) & (image < BRIGHTEST)
+    change = np.log((after[usable] + LOG_EPSILON) / (before[usable] + LOG_EPSILON)).astype(np.float64)
+    X, Z = (
+        np.stack([image[usable] for image in images]).astype(np.float64) for images in (regressors, around)
+    )
+    return _Products(Z @ X.T, Z @ change, np.abs(X).sum(1))
+
+
+def _regressors(events: Events, start: float, shape: tuple[int, int]) -> np.ndarray:  # [2, H, W] float32
+    """Return p and -n from the start on, each with what brightness leans beyond the last event."""
+    result = np.zeros((2, *shape), np.float32)
+    for sign, until in ((-1, start), (1, np.inf)):
+        part = events.between(-np.inf, until)
+        last = np.zeros(shape, np.int8)
+        last[part.y, part.x] = part.polarity  # of repeated pixels the last one stays
+        result[0] += sign * LEAN * (last > 0)
+        result[1] -= sign * LEAN * (last < 0)
+    inside = events.between(start, np.inf)
+    np.add.at(result, ((inside.polarity < 0).astype(int), inside.y, inside.x), inside.polarity)
+    return result
+
+
+def _solved(M: np.ndarray, v: np.ndarray) -> np.ndarray:  # [2, 2], [2] -> [2]
+    """Return M^-1 v, nan where the pixels do not tell positive and negative events apart."""
+    if np.linalg.cond(M) > 1e6:
+        return np.full(2, np.nan)
+    return np.asarray(np.linalg.solve(M, v))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sequences import record_tiny_room
 
-from edslam_ti.contrast import contrast_from_images
+from edslam_ti.contrast import contrast_from_images, contrast_threshold
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 
@@ -17,11 +17,12 @@ def test_threshold_is_found_within_ten_percent(
 ) -> None:
     folder = record_tiny_room(
         tmp_path / "room",
-        duration=0.4,
+        duration=0.6,
         contrast_threshold=positive,
         negative_contrast_threshold=negative,
     )
-    found = contrast_from_images(EventReplicaSequence(folder), 0.0, 1.0)
+    # At the very beginning of a simulation no pixel has anything left over of an earlier event.
+    found = contrast_from_images(EventReplicaSequence(folder), 0.15, 1.0)
     assert found is not None
     assert found.source == "images"
     assert found.positive == pytest.approx(positive, rel=0.1)
@@ -37,3 +38,14 @@ def test_without_images_nothing_is_claimed(
     assert contrast_from_images(tiny_sequence, 0.0, 1.0) is None
     monkeypatch.setattr(tiny_sequence, "image_timestamps", np.array([0.1]))
     assert contrast_from_images(tiny_sequence, 0.0, 1.0) is None
+
+
+def test_settings_state_the_mean_and_images_the_ratio(tmp_path: Path) -> None:
+    folder = record_tiny_room(
+        tmp_path / "room", duration=0.4, contrast_threshold=0.2, negative_contrast_threshold=0.26
+    )
+    found = contrast_threshold(0.5, EventReplicaSequence(folder), 0.0, 1.0)
+    positive, negative = found.relative
+    assert (found.value, found.source) == (0.5, "settings")
+    assert 0.5 * (positive + negative) == pytest.approx(1)
+    assert positive / negative == pytest.approx(0.2 / 0.26, rel=0.05)
