@@ -23,6 +23,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame, downscaled, downscaled_depth
 from edslam_ti.geometry import exp_matrix, log_vector, orthonormalized, rigid_inverse, rotation_angle_deg
+from edslam_ti.motion_prior import MeasuredPose, MotionPrior
 from edslam_ti.tracking import (
     MAX_CONDITION,
     MIN_PIXELS,
@@ -44,6 +45,7 @@ SMALL_GAIN = 0.01  # relative decrease of the cost: near enough for the next, fi
 MIN_FRAMES = 5  # before the first image is solved
 MIN_FLOW = 1.5  # pixels of brightness images that the scene must have moved before the first image is solved
 STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
+SMOOTHED_FROM = 2  # frames before those that are smoothed, which tell the velocity there
 MIN_SOLVE_FRAMES = 3  # between two solutions for one keyframe
 SILENT_SHARE = 0.02  # fewer events than this share of the usual number: the camera or the stream stopped
 SLOWING_SHARE = 0.2  # fewer than this in the frame before: the camera was coming to rest
@@ -73,6 +75,7 @@ class _Moment:
     """What was measured up to one frame, at the size of brightness images."""
 
     index: int  # of the frame in the trajectory
+    timestamp: float  # seconds
     change: np.ndarray  # [h, w] log brightness since the stretch of events began
     depth: _Depth | None
 
@@ -151,6 +154,8 @@ class BrightnessTracker:
         self._is_silent, self._silent_since = False, 0  # events are missing; first such frame
         self._usual_events, self._last_count = 0.0, 0
         self._num_misfits = 0
+        self._motion = MotionPrior()
+        self._settled: list[MeasuredPose] = []  # between the last two frames with depth, and these
         self._path = _Path(Trajectory())
         compile_kernels()
         depth_average.compile_kernels()
@@ -187,7 +192,7 @@ class BrightnessTracker:
         for _ in range(self._level):
             change = downscaled(change)
         depth = None if frame.depth is None else _Depth(frame.depth, frame.level(self._level).depth)
-        moment = _Moment(index, change, depth)
+        moment = _Moment(index, frame.timestamp, change, depth)
         self._moments = [*self._moments, moment][-WINDOW:]
         return moment
 
@@ -335,38 +340,69 @@ class BrightnessTracker:
         """Correct the poses between the last two frames with depth.
 
         They hang on brightness alone. What brightness alone gets wrong shows at both ends, where depth
-        tells the pose; in between it changes little by little.
+        tells the pose; in between it changes little by little. And velocity changes little.
         """
-        keyframe = self._keyframe
-        assert keyframe is not None
-        between: list[_Moment] = []
-        for before in reversed(self._moments[:-1]):
-            if before.depth is not None:
-                break
-            between.append(before)
-        if not between or before.depth is None:
+        frames = self._since_depth(moment)
+        if len(frames) < 3:
             return
         self._solve()
+        aligned = [a for m in frames if (a := self._aligned_without_depth(m)) is not None]
+        if len(aligned) < len(frames):
+            return
+        known = [self._path.pose(m.index) for m in (frames[0], frames[-1])]
+        start, end = (
+            log_vector(rigid_inverse(aligned[k].T_world_camera) @ T) for k, T in zip((0, -1), known)
+        )
+        self._learn_motion([(start, aligned[0]), (end, aligned[-1])])
+        measured = [MeasuredPose(frames[0].index, frames[0].timestamp, known[0], None)]
+        for m, a in zip(frames[1:-1], aligned[1:-1]):
+            share = (m.timestamp - frames[0].timestamp) / (moment.timestamp - frames[0].timestamp)
+            T = a.T_world_camera @ exp_matrix((1 - share) * start + share * end)
+            # Errors of neighbouring frames are alike: together they count as one.
+            information = a.system.H / (self._motion.error * (len(frames) - 2))
+            measured.append(MeasuredPose(m.index, m.timestamp, T, information))
+        measured.append(MeasuredPose(moment.index, moment.timestamp, known[1], None))
+        self._smooth(measured)
 
-        def by_brightness(m: _Moment) -> np.ndarray | None:  # [4, 4]
-            if m.index == keyframe.index:
-                return self._path.pose(m.index)
-            aligned = self._align(keyframe, keyframe.image_at(m), None, self._path.pose(m.index))
-            return (
-                aligned.T_world_camera if self._judged(aligned, self._path.pose(m.index)).converged else None
+    def _since_depth(self, moment: _Moment) -> list[_Moment]:
+        """Return the frames from the last one with depth up to a new one."""
+        for k in range(len(self._moments) - 2, -1, -1):
+            if self._moments[k].depth is not None:
+                return self._moments[k:]
+        return [moment]
+
+    def _aligned_without_depth(self, moment: _Moment) -> _Aligned | None:
+        keyframe, T = self._keyframe, self._path.pose(moment.index)
+        assert keyframe is not None
+        aligned = self._align(keyframe, keyframe.image_at(moment), None, T)
+        if moment.index == keyframe.index:
+            return replace(aligned, T_world_camera=T)
+        return aligned if self._judged(aligned, T).converged else None
+
+    def _learn_motion(self, errors: list[tuple[np.ndarray, _Aligned]]) -> None:
+        """Learn from the errors of brightness alone, and from the poses of frames with depth."""
+        for twist, aligned in errors:
+            if twist.any():  # the keyframe has no error towards itself
+                self._motion.learn_error(twist, aligned.system.H)
+        with_depth = [m for m in self._moments if m.depth is not None]
+        timestamps = np.array([m.timestamp for m in with_depth])
+        self._motion.learn_motion(timestamps, [self._path.pose(m.index) for m in with_depth])
+
+    def _smooth(self, measured: list[MeasuredPose]) -> None:
+        """Smooth poses between two frames with depth, and once more those between the two before."""
+        if self._motion.is_known:
+            follows = len(self._settled) > 0 and np.array_equal(
+                self._settled[-1].T_world_camera, measured[0].T_world_camera
             )
-
-        ends = []
-        for m in (before, moment):
-            T = by_brightness(m)
-            if T is None:
-                return
-            ends.append(log_vector(rigid_inverse(T) @ self._path.pose(m.index)))
-        for m in between:
-            T = by_brightness(m)
-            if T is not None:
-                share = (m.index - before.index) / (moment.index - before.index)
-                self._path.replace(m.index, T @ exp_matrix((1 - share) * ends[0] + share * ends[1]))
+            poses = [*(self._settled[:-1] if follows else []), *measured]
+            before = [m for m in self._moments if m.index < poses[0].index][-SMOOTHED_FROM:]
+            exact = [MeasuredPose(m.index, m.timestamp, self._path.pose(m.index), None) for m in before]
+            for m, T in zip(poses, self._motion.smoothed([*exact, *poses])[len(exact) :]):
+                self._path.replace(m.index, T)
+        else:
+            for m in measured:
+                self._path.replace(m.index, m.T_world_camera)
+        self._settled = measured
 
     def _solve(self, iterations: int = 12, is_robust: bool = True) -> None:
         """Solve for the keyframe's image from the last frames, and choose its pixels to align."""

@@ -94,7 +94,27 @@ def interpolate(T_start: Tensor, T_end: Tensor, fraction: Tensor | float) -> Ten
 
 def exp_matrix(twist: np.ndarray) -> np.ndarray:  # [6] -> [4, 4]
     """Return `se3_exp` of one twist, without torch: forty times as fast, for loops over single poses."""
-    x, y, z = w = twist[3:]
+    R, V = _rotation_and_jacobian(twist[3:])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, V @ twist[:3]
+    return T
+
+
+def log_vector(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6]
+    """Return `se3_log` of one motion, without torch unless it turns by nearly 180 degrees."""
+    R = T[:3, :3]
+    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = math.sqrt(float(axis @ axis))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1))
+    if angle > 3:
+        return se3_log(torch.from_numpy(T)).numpy()
+    w = axis * (angle / sine if sine > SMALL_ANGLE_SQUARED else 1.0)
+    return np.concatenate([np.linalg.solve(_rotation_and_jacobian(w)[1], T[:3, 3]), w])
+
+
+def _rotation_and_jacobian(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [3] -> two [3, 3]
+    """Return the rotation exp(w) and V, with exp of a twist (v, w) translating by V v."""
+    x, y, z = w
     theta2 = float(w @ w)
     if theta2 < SMALL_ANGLE_SQUARED:
         a = 1 - theta2 / 6 + theta2 * theta2 / 120
@@ -106,10 +126,7 @@ def exp_matrix(twist: np.ndarray) -> np.ndarray:  # [6] -> [4, 4]
         c = (theta - math.sin(theta)) / (theta2 * theta)
     W = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     W2 = W @ W
-    T = np.eye(4)
-    T[:3, :3] += a * W + b * W2
-    T[:3, 3] = twist[:3] + (b * W + c * W2) @ twist[:3]
-    return T
+    return np.eye(3) + (a * W + b * W2), np.eye(3) + (b * W + c * W2)
 
 
 def rigid_inverse(T: np.ndarray) -> np.ndarray:  # [4, 4]
@@ -132,8 +149,3 @@ def orthonormalized(T: np.ndarray) -> np.ndarray:  # [4, 4]
 def rotation_angle_deg(T: np.ndarray) -> float:  # [4, 4] -> degrees
     """Return the angle of the rotation part."""
     return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1.0, 1.0))))
-
-
-def log_vector(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6]
-    """Return `se3_log` of one motion."""
-    return se3_log(torch.from_numpy(T)).numpy()

@@ -21,6 +21,7 @@ RANKS: list[list[str]] = [
         "edslam_ti.losses",
         "edslam_ti.brightness",
         "edslam_ti.brightness_image",
+        "edslam_ti.motion_prior",
     ],
     [
         *(

@@ -9,6 +9,7 @@ from edslam_ti.geometry import (
     from_rotation_translation,
     interpolate,
     inverse,
+    log_vector,
     orthonormalized,
     rigid_inverse,
     rotation_angle_deg,
@@ -153,3 +154,4 @@ def test_single_motions_agree_with_the_batched_ones(angle: float) -> None:
         T = se3_exp(twist)
         np.testing.assert_allclose(exp_matrix(twist.numpy()), T.numpy(), atol=1e-15, rtol=1e-13)
         np.testing.assert_allclose(rigid_inverse(T.numpy()), inverse(T).numpy(), atol=1e-15)
+        np.testing.assert_allclose(log_vector(T.numpy()), se3_log(T).numpy(), atol=1e-12, rtol=1e-9)
