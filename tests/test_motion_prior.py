@@ -67,7 +67,9 @@ def test_smoothed_poses_are_the_minimum_of_the_cost() -> None:
     best = least_squares(residuals, np.zeros(6 * len(free)), xtol=1e-14, ftol=1e-14).x.reshape(-1, 6)
     assert np.abs(best).max() > 1e-3
     for k, twist, T in zip(free, best, [prior.smoothed(poses)[k] for k in free]):
-        np.testing.assert_allclose(T, poses[k].T_world_camera @ exp_matrix(twist), atol=1e-4)  # of 4e-3: one step
+        np.testing.assert_allclose(
+            T, poses[k].T_world_camera @ exp_matrix(twist), atol=1e-4
+        )  # of 4e-3: one step
 
 
 def test_quickness_of_the_motion_is_learned() -> None:
