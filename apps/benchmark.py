@@ -2,7 +2,8 @@
 
 Time the kernels, and steps of a run, beside alternatives (torch, numpy, and numba and dv-processing where
 installed) in turn in one process, and print a Markdown table; "limit" is the least time this machine could
-take. --out FOLDER also writes benchmark.md and benchmark.json there, and scaling.png for the suite `scaling`.
+take. What takes more than two seconds a call is timed once. --out FOLDER also writes benchmark.md and
+benchmark.json there, and scaling.png for the suite `scaling`.
 """
 
 from collections.abc import Sequence
@@ -38,7 +39,7 @@ def benchmark(
         sizes: widths and heights of images, in pairs
         gaussians: numbers of Gaussians
         events: numbers of events in a batch
-        rounds: timings of each candidate, of which the median counts
+        rounds: timings of each candidate, of which the median counts; one of those that take over two seconds
         threads: CPU threads of the kernels and of torch
         device: where the kernels run; alternatives stay on the CPU
         scene: sequence of the suite slam

@@ -182,9 +182,9 @@ def slam(scene: str, duration: float) -> Iterator[Row]:
     means = {name: 1e3 * np.mean(pairs[WARM_UP_FRAMES:], axis=0) for name, pairs in seconds.items()}
     wall_ours, cpu_ours = next(iter(means.values()))
     for name, (wall, cpu) in means.items():
-        yield Row(
-            "slam", task, name, float(wall), float(cpu), float(wall / wall_ours), float(cpu / cpu_ours), None
-        )
+        ratios = float(wall / wall_ours), float(cpu / cpu_ours)
+        frames = len(seconds[name]) - WARM_UP_FRAMES
+        yield Row("slam", task, name, float(wall), float(cpu), *ratios, None, frames)
 
 
 def _timed(run: Slam, sample: Sample) -> tuple[float, float]:

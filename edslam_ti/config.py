@@ -48,6 +48,9 @@ class TrackingConfig(Stage):
     """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
     directions: Literal["both", "forward"] = "both"
     """Patches of the reference seen in the new frame (forward), and also the other way round (Eq. 5)."""
+    form: Literal["additive", "compositional"] = "additive"
+    """Jacobians of the view that patches are warped to, anew at each step (additive), or of the patches,
+    once (inverse compositional, Baker and Matthews 2004). Time surfaces only."""
     surface_sigma: float = Field(0.15, gt=0)
     """Standard deviation of a time-surface residual."""
     depth_weight: float = Field(3.0, ge=0)

@@ -62,7 +62,7 @@ class _Reference:
     """A frame to align to, with its patches at every pyramid level."""
 
     frame: Frame
-    points: list[Tensor]  # [blocks, 4, LANES] each, from `Patches.points`
+    points: list[Tensor]  # [blocks, 4 or 16, LANES] each, from `Patches.points`
     has_surface: bool  # False: too few events yet, only its depth can be aligned
 
 
@@ -224,7 +224,8 @@ class BidirectionalPatchTracker:
             size = config.patch_size if k == 0 else max(3, config.patch_size // 2 | 1)
             at_level = _distinct(centres >> k) if k else centres
             patches = extract_patches(level.surface, level.depth, at_level.astype(np.int32), size)
-            points.append(patches.points(level.camera.intrinsics))
+            template = (level.surface, level.depth) if config.form == "compositional" else None
+            points.append(patches.points(level.camera.intrinsics, template))
         return _Reference(frame, points, has_surface)
 
 

@@ -45,6 +45,7 @@ TWIN_LIMIT = 3e7  # Gaussians times pixels that the torch twin still manages, al
 DV_LIMIT = 2_000_000  # events: dv-processing takes them from Python one by one
 NUM_PATCHES, PATCH_SIZE = 400, 9
 MIN_SAMPLE = 0.005  # seconds
+SLOW = 2.0  # seconds a call: timed once
 # Floating point operations, counted in the formulas
 FLOPS_FORWARD, FLOPS_BACKWARD = 30, 48  # of a (pixel, Gaussian) pair
 FLOPS_LINEARISE = 230  # of a patch pixel: warp, two samples, two Jacobians, 2 x 27 sums
@@ -73,6 +74,7 @@ class Row:
     wall_times_ours: float  # wall time in units of ours
     cpu_times_ours: float
     limit_ms: float | None  # the least that the machine could take; None: not counted
+    rounds: int  # timings
 
     def as_markdown(self) -> str:
         """Return the row of a table: task, name, wall and CPU ms, both in units of ours, limit ms."""
@@ -112,10 +114,11 @@ class Stopwatch:
             seconds.append(time.perf_counter() - started)
         return min(seconds)
 
-    def _calls(self, run: Callable[[], object]) -> int:
-        """Return how many calls make a sample long enough to be timed; warms up."""
+    def _calls(self, run: Callable[[], object]) -> tuple[int, int]:
+        """Return how many calls make a sample long enough to be timed, and of how many samples; warms up."""
         _seconds(run)
-        return max(1, min(1000, int(MIN_SAMPLE / _seconds(run)[0])))
+        seconds, _ = _seconds(run)
+        return max(1, min(1000, int(MIN_SAMPLE / seconds))), 1 if seconds > SLOW else self._rounds
 
     def compare(self, suite: str, task: str, candidates: Candidates, work: Work | None = None) -> list[Row]:
         """Return the medians of all candidates; the first calls of each are not counted."""
@@ -124,18 +127,23 @@ class Stopwatch:
         # Short ones are called many times for one sample: all of them then find their data in the cache.
         calls = {name: self._calls(run) for name, run in candidates.items()}
         samples: dict[str, list[tuple[float, float]]] = {name: [] for name in candidates}
-        for _ in range(self._rounds):
+        for k in range(self._rounds):
             for name, run in candidates.items():
-                samples[name].append(_seconds(run, calls[name]))
+                number, rounds = calls[name]
+                if k < rounds:
+                    samples[name].append(_seconds(run, number))
         medians = {name: 1e3 * np.median(values, axis=0) for name, values in samples.items()}
         wall_ours, cpu_ours = medians[next(iter(medians))]
         limit = None
         if work is not None:
             limit = 1e3 * max(work.num_bytes / self.bytes_per_second, work.flops / self.flops_per_second)
         return [
-            Row(suite, task, name, float(w), float(c), float(w / wall_ours), float(c / cpu_ours), limit)
+            Row(
+                suite, task, name, float(w), float(c), float(w / wall_ours), float(c / cpu_ours), limit,
+                len(samples[name]),
+            )
             for name, (w, c) in medians.items()
-        ]
+        ]  # fmt: skip
 
 
 def _seconds(run: Callable[[], object], calls: int = 1) -> tuple[float, float]:
@@ -421,11 +429,14 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
     """Linearise the alignment once, both directions, as an iteration of the tracker does."""
     intrinsics, model = (0.8 * size[0], 0.8 * size[0], size[0] / 2, size[1] / 2), ResidualModel()
     patches, surface, depth, T = tracking_inputs(size)
-    direction = Direction(patches.points(intrinsics), 0, model)
-    alignment = Alignment([direction] * 2, np.stack([surface, depth], -1)[None], intrinsics)
+    view = np.stack([surface, depth], -1)[None]
+    additive, compositional = (
+        Alignment([Direction(patches.points(intrinsics, template), 0, model)] * 2, view, intrinsics)
+        for template in (None, (surface, depth))
+    )
     poses = [T, np.linalg.inv(T)]
 
-    def linearise() -> object:
+    def linearise(alignment: Alignment) -> object:
         forward, backward = alignment.linearise(poses)
         return forward + backward.transformed(-adjoint(poses[1]))
 
@@ -434,7 +445,8 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
         for pose, inverse in zip(poses, (False, True))
     ]
     candidates = {
-        OURS: linearise,
+        OURS: lambda: linearise(additive),
+        "Taichi, inverse compositional": lambda: linearise(compositional),
         "numpy": lambda: [linearise_in_numpy(*each) for each in arguments],
         "torch twin": lambda: [linearise_in_torch(*each) for each in arguments],
     }
@@ -490,4 +502,4 @@ def cold_start(threads: int, rounds: int) -> Iterator[Row]:
     total = parts.sum(0)
     for name, (wall, cpu) in zip(("all", *names), [total, *parts]):
         ratios = float(wall / total[0]), float(cpu / total[1])
-        yield Row("cold_start", "cold start", name, float(wall), float(cpu), *ratios, None)
+        yield Row("cold_start", "cold start", name, float(wall), float(cpu), *ratios, None, rounds)

@@ -11,6 +11,11 @@ Both residuals are divided by their standard deviation and weighted by Huber's f
 unsquared norms, and this is its smooth least-squares form. The unknown is a twist xi, order
 (translation, rotation), that updates T_b_a <- exp(xi) T_b_a.
 
+The inverse-compositional form (Baker and Matthews 2004) updates T_b_a <- T_b_a exp(xi) and takes the Jacobian
+of the patches in their own view, which stays the same, for that of the other, which it is where they align:
+
+    dr_surface/dxi = dS(surface_a, pi(exp(xi) p))/dxi,    dr_depth/dxi = d(p_z - S(depth_a, pi(p)))/dxi
+
 All patches of all directions are linearised in one launch, sixteen pixels at a time (kernels.lanes):
 points of view a and their Jacobians are vectors, only the corners of the bilinear samples are fetched
 pixel by pixel.
@@ -35,6 +40,8 @@ SUM_SIZE = 31
 FX, FY, CX, CY, MAX_DEPTH_DIFFERENCE, SURFACE_SIGMA = 12, 13, 14, 15, 16, 17
 DEPTH_WEIGHT, DEPTH_SIGMA, DEPTH_SIGMA_2, HUBER_THRESHOLD = 18, 19, 20, 21
 JOB_SIZE = 22
+POINT_SIZE = 4  # X, Y, Z, value; then, in the compositional form, both residuals' Jacobians
+MAX_SLOPE = 0.05  # share of depth a pixel: more is an edge, whose depth says nothing about the surface
 
 
 @ti.func
@@ -142,7 +149,7 @@ def interpolate(corner, u, v):
 @ti.kernel
 def _linearise(
     # inputs
-    points: lanes(2),  # [blocks, 4] X, Y, Z in view a (metres, Z = 0: none) and surface value
+    points: lanes(2),  # [blocks, POINT_SIZE] X, Y, Z in view a (metres, Z = 0: none) and surface value
     images: ti.types.ndarray(ndim=1),  # [V * H * W * 2] surface and depth (metres, 0 = missing) of all views
     height: ti.i32,
     width: ti.i32,
@@ -151,6 +158,7 @@ def _linearise(
     num_workers: ti.i32,
     # outputs
     sums: ti.types.ndarray(ndim=2),  # [P, SUM_SIZE]
+    is_compositional: ti.template(),
 ):
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
@@ -193,8 +201,7 @@ def _linearise(
                     # tau_d: the depth check of Sec. III-B; without depth in b there is nothing to check.
                     disagreement = ti.select(has_depth, ti.max(r_depth, d - p_z), 0.0)
                     keep = inside & (disagreement < jobs[job, MAX_DEPTH_DIFFERENCE])
-                    # A depth edge between the four corners says nothing about the surface.
-                    is_smooth = keep & has_depth & (d_high - d_low < 0.05 * d_high)
+                    is_smooth = keep & has_depth & (d_high - d_low < MAX_SLOPE * d_high)
                     depth_sigma = jobs[job, DEPTH_SIGMA] + jobs[job, DEPTH_SIGMA_2] * p_z * p_z
                     # dx'/dp' = [fx / z, 0, -fx x / z^2], [0, fy / z, -fy y / z^2]; dp'/dxi = [I | -[p']_x]
                     du, dv = fx * inv_z, fy * inv_z
@@ -206,10 +213,16 @@ def _linearise(
                             g_x, g_y, g_z = 0.0 - d_x * du, 0.0 - d_y * dv, 1.0 + d_x * du_z + d_y * dv_z
                             r, scale, is_used = r_depth, 1.0 / depth_sigma, is_smooth
                             share, counted = depth_weight, ti.select(depth_weight > 0, 1.0, 0.0)
-                        J = [
+                        additive = [
                             g_x, g_y, g_z,
                             p_y * g_z - p_z * g_y, p_z * g_x - p_x * g_z, p_x * g_y - p_y * g_x,
                         ]  # fmt: skip
+                        J = [
+                            points[block, POINT_SIZE + 6 * k + a]
+                            if ti.static(is_compositional)
+                            else additive[a]
+                            for a in range(6)
+                        ]
                         weight, cost = huber(r * scale, threshold)
                         total[COST] += ti.select(is_used, share * cost, 0.0)
                         total[NUM_SURFACE + k] += ti.select(is_used, counted, 0.0)
@@ -231,18 +244,57 @@ class Patches:
     pixels: np.ndarray  # [M, 3] float: x, y, inverse depth in 1/m (0 = no depth: left out)
     values: np.ndarray  # [M] float: surface values
 
-    def points(self, intrinsics: tuple[float, float, float, float]) -> torch.Tensor:  # [blocks, 4, LANES]
-        """Return (X, Y, Z, value) in lanes: points in metres in the camera's frame, Z = 0 where unknown."""
+    def points(
+        self,
+        intrinsics: tuple[float, float, float, float],
+        template: tuple[np.ndarray, np.ndarray] | None = None,  # surface and depth [H, W] of their own view
+    ) -> torch.Tensor:  # [blocks, 4 or 16, LANES]
+        """Return (X, Y, Z, value) in lanes: points in metres in the camera's frame, Z = 0 where unknown.
+
+        With a template the Jacobians of the inverse-compositional form follow.
+        """
         fx, fy, cx, cy = intrinsics
         x, y, rho = self.pixels.T
         m = len(rho)
-        result = torch.empty(-(-m // LANES), 4, LANES, dtype=float_dtype())
-        rows = np.zeros((4, len(result) * LANES), result.numpy().dtype)
+        size = POINT_SIZE if template is None else POINT_SIZE + 12
+        result = torch.empty(-(-m // LANES), size, LANES, dtype=float_dtype())
+        rows = np.zeros((size, len(result) * LANES), result.numpy().dtype)
         np.divide(1, rho, out=rows[2, :m], where=rho > 0)
         rows[0, :m], rows[1, :m] = (x - cx) / fx * rows[2, :m], (y - cy) / fy * rows[2, :m]
         rows[3, :m] = self.values
-        result.numpy()[:] = rows.reshape(4, -1, LANES).swapaxes(0, 1)
+        if template is not None:
+            rows[POINT_SIZE:, :m] = _template_jacobians(self.pixels, rows[:3, :m], *template, intrinsics)
+        result.numpy()[:] = rows.reshape(size, -1, LANES).swapaxes(0, 1)
         return result
+
+
+def _template_jacobians(
+    pixels: np.ndarray,  # [M, 3] x, y, inverse depth
+    points: np.ndarray,  # [3, M] metres
+    surface: np.ndarray,  # [H, W]
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+    intrinsics: tuple[float, float, float, float],
+) -> np.ndarray:  # [12, M]
+    """Return dr_surface/dxi and dr_depth/dxi by central differences; 0 at borders and edges of depth."""
+    (height, width), (fx, fy, _, _) = surface.shape, intrinsics
+    column, row = pixels[:, 0].astype(np.intp), pixels[:, 1].astype(np.intp)
+    inside = (column > 0) & (column < width - 1) & (row > 0) & (row < height - 1) & (pixels[:, 2] > 0)
+    at = np.where(inside, row * width + column, width + 1)
+    p = np.where(inside, points, 1.0).astype(points.dtype)
+    du, dv = fx / p[2], fy / p[2]
+    du_z, dv_z = du * p[0] / p[2], dv * p[1] / p[2]
+    result = np.empty((2, 6, len(at)), points.dtype)
+    for image, along_z, sign, J in ((surface, 0, 1, result[0]), (depth, 1, -1, result[1])):
+        left, right, above, below = (image.ravel()[at + step] for step in (-1, 1, -width, width))
+        along_x, along_y = sign * (right - left) / 2, sign * (below - above) / 2
+        g = J[:3]
+        g[0], g[1], g[2] = along_x * du, along_y * dv, along_z - along_x * du_z - along_y * dv_z
+        J[3], J[4], J[5] = p[1] * g[2] - p[2] * g[1], p[2] * g[0] - p[0] * g[2], p[0] * g[1] - p[1] * g[0]
+        J[:, ~inside] = 0
+    neighbours = np.stack([left, right, above, below])  # of depth
+    lowest, highest = neighbours.min(0), neighbours.max(0)
+    result[1][:, (lowest <= NEAR) | (highest - lowest >= 2 * MAX_SLOPE * highest)] = 0
+    return result.reshape(12, -1)
 
 
 @dataclass(frozen=True)
@@ -328,7 +380,7 @@ def sample_bilinear(
 class Direction:
     """Patches of one view that are aligned to the image of another."""
 
-    points: torch.Tensor  # [blocks, 4, LANES], from `Patches.points`
+    points: torch.Tensor  # [blocks, 4 or 16, LANES], from `Patches.points`; all directions alike
     view: int  # index of the image
     model: ResidualModel
 
@@ -345,7 +397,9 @@ class Alignment:
         check_shape("views", views, (None, None, None, 2))
         self._views = np.ascontiguousarray(views, _numpy_float())
         points = [direction.points.numpy() for direction in directions]
-        self._points = torch.empty(sum(map(len, points)), 4, LANES, dtype=float_dtype())
+        rows = points[0].shape[1] if points else POINT_SIZE
+        self._is_compositional = rows > POINT_SIZE
+        self._points = torch.empty(sum(map(len, points)), rows, LANES, dtype=float_dtype())
         np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
         self._jobs = np.empty((len(directions), JOB_SIZE), _numpy_float())
         self._parts: list[slice] = []
@@ -375,16 +429,19 @@ class Alignment:
             num_workers = min(workers(), 1 + len(self._bounds) // PARTS_PER_WORKER)
             _linearise(
                 self._points, self._views.reshape(-1), height, width, self._bounds, self._jobs,
-                num_workers, self._sums,
+                num_workers, self._sums, self._is_compositional,
             )  # fmt: skip
         totals = [self._sums[parts].sum(0, dtype=np.float64) for parts in self._parts]
-        return [
+        systems = [
             NormalEquations(
                 total[_SYMMETRIC], total[21:COST], float(total[COST]),
                 int(total[NUM_SURFACE]), int(total[NUM_DEPTH]), int(total[NUM_USABLE]),
             )
             for total in totals
         ]  # fmt: skip
+        if self._is_compositional:  # exp(xi) T = T exp(Ad(T^-1) xi)
+            systems = [s.transformed(np.linalg.inv(adjoint(T))) for s, T in zip(systems, poses)]
+        return systems
 
 
 def normal_equations(

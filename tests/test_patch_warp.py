@@ -112,6 +112,57 @@ def test_normal_equations_match_autograd_of_the_twin(is_inverse: bool) -> None:
     assert np.linalg.norm(ours.g - g.numpy()) / np.linalg.norm(g) < 5e-3
 
 
+def test_compositional_jacobians_match_autograd_of_the_template() -> None:
+    v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float64)
+    surface, depth = 0.5 + 0.25 * np.sin(u / 4) + 0.2 * np.cos(v / 3 - u / 9), 2 + 0.3 * np.sin(u / 15)
+    centres = 8 + make_centres(40, 3) % (np.array([48, 32], np.int32))  # inside the image, wherever they move
+    patches, T = extract_patches(surface, depth, centres, 5), make_motion(0.005, seed=4)
+    direction = Direction(patches.points(INTRINSICS, (surface, depth)), 0, MODEL)
+    (ours,) = Alignment([direction], np.stack([surface, depth], -1)[None], INTRINSICS).linearise([T])
+    arrays = [torch.from_numpy(x) for x in (patches.pixels, patches.values, surface, depth)]
+    pixels, column, row = arrays[0], arrays[0][:, 0].long(), arrays[0][:, 1].long()
+
+    def templates(xi: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        warped = reference.warp_pixels(pixels, se3_exp(xi), INTRINSICS)
+        moved = warped[:, :2] - pixels[:, :2]
+
+        def change(image: torch.Tensor) -> torch.Tensor:
+            along_y, along_x = (slope[row, column] for slope in torch.gradient(image))
+            return along_x * moved[:, 0] + along_y * moved[:, 1]
+
+        return change(arrays[2]), warped[:, 2] - change(arrays[3])
+
+    residuals = reference.alignment_residuals(*arrays, torch.from_numpy(T), INTRINSICS, MODEL)
+    assert len(residuals[0]) == len(residuals[1]) == len(pixels) == ours.num_depth
+    jacobians = torch.autograd.functional.jacobian(templates, torch.zeros(6, dtype=torch.float64))
+    z = reference.warp_pixels(pixels, torch.from_numpy(T), INTRINSICS)[:, 2:]
+    sigmas = (MODEL.surface_sigma, MODEL.depth_sigma + MODEL.depth_sigma_2 * z**2)
+    H, g = torch.zeros(6, 6).double(), torch.zeros(6).double()
+    for r, J, sigma, share in zip(residuals, jacobians, sigmas, (1.0, MODEL.depth_weight)):
+        w = share * torch.clamp(MODEL.huber_threshold / r.abs().clamp_min(1e-12), max=1.0)
+        H += (J / sigma).T @ (w[:, None] * J / sigma)
+        g += (J / sigma).T @ (w * r)
+    ours = ours.transformed(adjoint(T))  # from exp(xi) T to T exp(xi)
+    # float32 residuals at depth sigma of millimetres against float64
+    assert np.linalg.norm(ours.H - H.numpy()) / np.linalg.norm(H) < 1e-3
+    assert np.linalg.norm(ours.g - g.numpy()) / np.linalg.norm(g) < 5e-3
+
+
+def test_compositional_jacobians_are_the_additive_ones_where_views_align() -> None:
+    surface, depth = make_view(0)
+    centres = 8 + make_centres(80, 8) % np.array([48, 32], np.int32)
+    patches, view = extract_patches(surface, depth, centres, 5), np.stack([surface, depth], -1)[None]
+    additive, compositional = (
+        Alignment([Direction(patches.points(INTRINSICS, template), 0, MODEL)], view, INTRINSICS).linearise(
+            [np.eye(4)]
+        )[0]
+        for template in (None, (surface, depth))
+    )
+    assert compositional.num_surface == additive.num_surface
+    # central differences, and none beside holes in depth, against those between neighbours
+    assert np.linalg.norm(compositional.H - additive.H) / np.linalg.norm(additive.H) < 0.1
+
+
 def test_depth_that_disagrees_by_more_than_tau_d_is_discarded() -> None:
     surface, depth = make_view(0)
     patches = extract_patches(surface, depth, make_centres(40, 5), 5)

@@ -39,6 +39,18 @@ def test_event_surfaces_alone_are_tracked_to_a_centimetre(
     assert ate_cm(slam, tiny_sequence) < 1.0  # 0.33 cm was measured
 
 
+def test_compositional_form_finds_nearly_the_same_poses(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    additive, compositional = (
+        tracked(tiny_sequence, tiny_samples, settings(tracking={"brightness": False, "form": form}))
+        for form in ("additive", "compositional")
+    )
+    assert lost(compositional) == []
+    assert ate_cm(compositional, tiny_sequence) < 0.15
+    assert not np.array_equal(compositional.trajectory.poses, additive.trajectory.poses)
+
+
 def test_one_direction_is_enough_in_a_small_room_and_differs(
     run: Slam, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
