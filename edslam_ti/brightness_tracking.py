@@ -22,8 +22,9 @@ from edslam_ti.brightness_image import (
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame, downscaled, downscaled_depth
-from edslam_ti.geometry import exp_matrix, log_vector, orthonormalized, rigid_inverse, rotation_angle_deg
+from edslam_ti.geometry import exp_matrix, is_near, log_vector, orthonormalized, rigid_inverse
 from edslam_ti.motion_prior import MeasuredPose, MotionPrior
+from edslam_ti.pose_graph import Revisit, corrections, spread
 from edslam_ti.tracking import (
     MAX_CONDITION,
     MIN_PIXELS,
@@ -151,6 +152,7 @@ class BrightnessTracker:
         self._moments: list[_Moment] = []  # the last frames of the stretch
         self._keyframe: _Keyframe | None = None  # None: no image yet
         self._old_keyframes: list[_Keyframe] = []
+        self._revisits: list[Revisit] = []
         self._is_silent, self._silent_since = False, 0  # events are missing; first such frame
         self._usual_events, self._last_count = 0.0, 0
         self._num_misfits = 0
@@ -554,11 +556,14 @@ class BrightnessTracker:
                 continue
             keyframe.is_new_place = max(shares) < self._config.min_overlap
             drift = rigid_inverse(T_now) @ T
-            if _is_near(drift, *NO_DRIFT):
-                return ""
-            if _is_near(drift, *MAX_DRIFT):
-                self._correct(T, old.index, keyframe.index)
+            if not is_near(drift, *MAX_DRIFT):
+                continue
+            T_old_new = rigid_inverse(self._path.pose(old.index)) @ T
+            self._revisits.append(Revisit(old.index, keyframe.index, T_old_new))
+            if not is_near(drift, *NO_DRIFT):
+                self._correct()
                 return f"place of frame {old.index} seen again"
+            return ""
         return ""
 
     def _relocalise(self) -> str:
@@ -627,14 +632,15 @@ class BrightnessTracker:
         T_new_old[:3, :3], T_new_old[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
         return self._path.pose(old.index) @ rigid_inverse(T_new_old)
 
-    def _correct(self, T_world_camera: np.ndarray, start: int, end: int) -> None:
-        """Move the keyframe to its pose: frames from `end` on with it, those since `start` in part."""
+    def _correct(self) -> None:
+        """Move all frames so that keyframes agree with their neighbours and with all revisits."""
         keyframe = self._keyframe
         assert keyframe is not None
-        twist = log_vector(T_world_camera @ rigid_inverse(self._path.pose(keyframe.index)))
-        for index in range(start + 1, len(self._path)):
-            share = min(1.0, (index - start) / max(end - start, 1))
-            self._path.replace(index, exp_matrix(share * twist) @ self._path.pose(index))
+        seen = {k for revisit in self._revisits for k in (revisit.old, revisit.new)}
+        nodes = sorted(seen | {k.index for k in self._old_keyframes} | {keyframe.index})
+        moved = corrections(nodes, [self._path.pose(k) for k in nodes], self._revisits)
+        for index in range(nodes[0] + 1, len(self._path)):
+            self._path.replace(index, spread(index, nodes, moved) @ self._path.pose(index))
 
     def _bridge(self, T_world_camera: np.ndarray) -> None:
         """Move a stretch so that its keyframe is at the given pose, and the gap before it in between.
@@ -648,7 +654,7 @@ class BrightnessTracker:
         correction = T_world_camera @ rigid_inverse(self._path.pose(keyframe.index))
         for index in range(last, len(self._path)):
             self._path.replace(index, correction @ self._path.pose(index))
-        if _is_near(correction, *COASTED) or first < 1:
+        if is_near(correction, *COASTED) or first < 1:
             twist = log_vector(correction)
             for index in range(first + 1, last):
                 share = (index - first) / (last - first)
@@ -662,10 +668,6 @@ class BrightnessTracker:
             u = (index - first) / n
             twist = u * (1 - u) ** 2 * before + u**2 * (3 - 2 * u) * across - u**2 * (1 - u) * after
             self._path.replace(index, start @ exp_matrix(twist))
-
-
-def _is_near(correction: np.ndarray, distance: float, angle: float) -> bool:  # [4, 4], metres, degrees
-    return float(np.linalg.norm(correction[:3, 3])) < distance and rotation_angle_deg(correction) < angle
 
 
 class _Path:

@@ -5,7 +5,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.optim.adam import adam
 
@@ -63,6 +65,7 @@ class GaussianMap:
         self._raw = {name: value.requires_grad_() for name, value in empty.items()}
         self._moments = {name: Moments.zeros_like(value) for name, value in empty.items()}
         self._steps = 0
+        self._frames = torch.empty(0, dtype=torch.int64)  # [N] whose depth each is from
         self._cell_sizes = torch.tensor(config.brightness_cells)
         self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
         self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
@@ -114,9 +117,11 @@ class GaussianMap:
         scales: Tensor,  # [M, 3] metres
         opacity: float,
         colors: Tensor,  # [M, 1] in (0, 1)
+        frame: int = 0,  # whose depth they are from
     ) -> None:
         """Append Gaussians; their optimiser moments start at zero."""
         m = len(means)
+        self._frames = torch.cat([self._frames, torch.full((m,), frame)])
         cells = self._cells_of(means)
         shared = self._cell_table.detach()[cells].sum(-1, keepdim=True)
         self._cells = torch.cat([self._cells, cells])
@@ -136,6 +141,25 @@ class GaussianMap:
     def keep(self, mask: Tensor) -> None:
         """Keep the Gaussians where mask [N] is true."""
         self._map_rows(lambda table: table[mask])
+
+    @torch.no_grad()
+    def follow(self, corrections: Mapping[int, np.ndarray]) -> None:  # [4, 4] by frame, T_new T_old^-1
+        """Move the Gaussians from every frame's depth as its pose has been moved."""
+        last = int(self._frames.max()) if len(self) else 0
+        of_frames = np.tile(np.eye(4), (last + 1, 1, 1))
+        for frame, correction in corrections.items():
+            if frame <= last:
+                of_frames[frame] = correction
+        turns = Rotation.from_matrix(of_frames[:, :3, :3]).as_quat(scalar_first=True)
+        T = torch.from_numpy(of_frames).float()[self._frames]  # [N, 4, 4]
+        w, x, y, z = torch.from_numpy(turns).float()[self._frames].unbind(-1)
+        means, (a, b, c, d) = self._raw["means"], self._raw["quats"].unbind(-1)
+        means.copy_((T[:, :3, :3] @ means[..., None])[..., 0] + T[:, :3, 3])
+        turned = (
+            *(w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c),
+            *(w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a),
+        )  # the turn's quaternion times the Gaussian's
+        self._raw["quats"].copy_(torch.stack(turned, -1))
 
     def set_colors(self, colors: Tensor) -> None:  # [N, 1] in (0, 1)
         """Overwrite every Gaussian's brightness; the cells keep theirs."""
@@ -175,7 +199,7 @@ class GaussianMap:
 
     def _map_rows(self, change: Callable[[Tensor], Tensor]) -> None:
         """Replace every table of one row a Gaussian."""
-        self._cells = change(self._cells)
+        self._cells, self._frames = change(self._cells), change(self._frames)
         self._raw = {name: change(value.detach()).requires_grad_() for name, value in self._raw.items()}
         self._moments = {name: Moments(*map(change, pair)) for name, pair in self._moments.items()}
 

@@ -149,3 +149,8 @@ def orthonormalized(T: np.ndarray) -> np.ndarray:  # [4, 4]
 def rotation_angle_deg(T: np.ndarray) -> float:  # [4, 4] -> degrees
     """Return the angle of the rotation part."""
     return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1.0, 1.0))))
+
+
+def is_near(T: np.ndarray, distance: float, angle: float) -> bool:  # [4, 4], metres, degrees
+    """Return whether a motion is shorter and turns less than that."""
+    return float(np.linalg.norm(T[:3, 3])) < distance and rotation_angle_deg(T) < angle

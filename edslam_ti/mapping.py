@@ -15,7 +15,7 @@ from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.event_images import EventImages, evenly
 from edslam_ti.frame import Frame
 from edslam_ti.gaussians import GaussianMap, Gaussians
-from edslam_ti.geometry import orthonormalized, se3_exp
+from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
 from edslam_ti.pointcloud import depth_to_points, surface_discs
@@ -31,6 +31,7 @@ SOLVE_EVERY = 5  # frames between solutions of the start image
 MAX_RECOLOURED = 24  # frames looked at for the brightness that such a solution gives Gaussians
 FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
 MAX_STRETCH = 4.0  # of a new Gaussian on a surface that falls away
+SETTLING = (0.002, 0.1)  # metres, degrees: poses that change by less are only being refined
 EVENT_VARIANCE = 0.1  # squared log brightness: scale of the event loss
 
 
@@ -168,6 +169,7 @@ class GaussianMapper:
     def _update(self, frame: Frame, trajectory: Trajectory) -> None:
         index = self._num_frames
         self._num_frames += 1
+        self._follow(trajectory)
         self.images.append(frame, index)
         if frame.depth is not None and not frame.is_held_out:
             self._take_in_depth(frame, index, trajectory)
@@ -215,6 +217,15 @@ class GaussianMapper:
         return gaussians.means.detach().numpy(), gaussians.colors.numpy()[:, 0]
 
     # --- growing ---
+
+    def _follow(self, trajectory: Trajectory) -> None:
+        """Deform the map as the tracker has corrected the poses that it was built from.
+
+        Images from events belong to frames and need not be moved.
+        """
+        corrections = trajectory.take_corrections()
+        if any(not is_near(T, *SETTLING) for T in corrections.values()):
+            self.gaussians.follow(corrections)
 
     def _take_in_depth(self, frame: Frame, index: int, trajectory: Trajectory) -> None:
         assert frame.depth is not None
@@ -283,6 +294,7 @@ class GaussianMapper:
             torch.from_numpy(scales.astype(np.float32)),
             config.initial_opacity,
             torch.from_numpy(brightness.astype(np.float32))[:, None],
+            index,
         )
 
     def _prune(self) -> None:

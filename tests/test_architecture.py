@@ -31,7 +31,7 @@ RANKS: list[list[str]] = [
             "edslam_ti.keyframes",
             "edslam_ti.event_images",
         ),
-        *("edslam_ti.brightness_tracking", "edslam_ti.mapping"),
+        *("edslam_ti.pose_graph", "edslam_ti.brightness_tracking", "edslam_ti.mapping"),
     ],
     ["edslam_ti.slam"],
     [
@@ -60,7 +60,7 @@ LIBRARIES: dict[str, list[str]] = {
     ],
     "yaml": ["edslam_ti.config"],
     "scipy": [
-        *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.brightness"),
+        *("edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.gaussians", "edslam_ti.brightness"),
         *("edslam_ti.pointcloud", "edslam_ti.pictures"),
     ],
     "cv2": [
@@ -88,6 +88,7 @@ LIBRARIES: dict[str, list[str]] = {
 }
 USES_OPEN3D = [
     "edslam_ti.surface_errors",
+    "edslam_ti.pose_graph",
     *("edslam_ti.simulation.*", "edslam_ti.pointcloud", "edslam_ti.volume"),
     *("edslam_ti.baselines.*", "edslam_ti.export", "edslam_ti.visualization"),
 ]

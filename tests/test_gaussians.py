@@ -1,11 +1,13 @@
 """The Gaussian map: what is added is shown, and Adam's memory follows every Gaussian."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from edslam_ti.config import MappingConfig
 from edslam_ti.gaussians import PARAMETERS, GaussianMap
+from edslam_ti.geometry import exp_matrix
 
 CONFIG = MappingConfig()
 RATES = {
@@ -116,6 +118,26 @@ def test_a_part_is_optimised_as_the_whole_would_be_and_the_rest_stays() -> None:
     for name, value in whole.raw.items():
         torch.testing.assert_close(value[chosen], same.raw[name][chosen], msg=name)
         assert torch.equal(value[1::2], before[name][1::2]), name
+
+
+def test_gaussians_follow_the_frame_they_are_from() -> None:
+    gaussians = GaussianMap(CONFIG)
+    for frame in (3, 8):
+        gaussians.add(
+            torch.tensor([[1.0, 0.0, 0.0]]),
+            upright(1),
+            torch.full((1, 3), 0.1),
+            0.5,
+            torch.full((1, 1), 0.5),
+            frame,
+        )
+    quarter = exp_matrix(np.array([0, 0, 0, 0, 0, np.pi / 2]))  # about z
+    quarter[2, 3] = 0.5
+    gaussians.follow({8: quarter, 99: quarter})
+    expected = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.5]])
+    torch.testing.assert_close(gaussians.raw["means"].detach(), expected)
+    half = 0.5**0.5
+    torch.testing.assert_close(gaussians.raw["quats"].detach()[1], torch.tensor([half, 0.0, 0.0, half]))
 
 
 def test_kept_gaussians_keep_their_brightness_after_cells_have_moved() -> None:

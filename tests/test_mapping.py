@@ -8,9 +8,11 @@ import pytest
 from sequences import make_slam, settings
 
 from edslam_ti.datasets import EventDepthSequence, Sample
-from edslam_ti.evaluation import evaluate_images
+from edslam_ti.evaluation import depth_l1_cm, evaluate_images
+from edslam_ti.geometry import exp_matrix
 from edslam_ti.mapping import GaussianMapper, PoseRefiner, densify_mask, stride_in_room
 from edslam_ti.slam import Slam
+from edslam_ti.tracking import TruePoses
 from edslam_ti.trajectory import Trajectory
 
 FEW = {"iterations": 1, "final_iterations": 3}
@@ -167,6 +169,38 @@ def test_map_of_a_few_gaussians_is_refined_like_any_other(
     mapper.finish(slam.trajectory, lambda fraction: True)
     assert mapper.num_gaussians == 4
     assert np.isfinite(mapper.points()[1]).all()
+
+
+def test_map_follows_when_a_revisit_corrects_the_path(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = [tiny_sequence.true_pose(s.timestamp) for s in tiny_samples]
+    drift = np.array([2e-3, 0.0, 8e-3, 0.0, 1e-3, 5e-4])  # a frame: 12 cm and a degree in all
+
+    def depth_error(share: float = 1.0) -> float:
+        """Return the depth L1 (cm) of a map whose path, drifted, was corrected before its last frame."""
+        *before, last = tiny_samples
+        poses = {
+            s.timestamp: T @ exp_matrix(share * k * drift) for k, (s, T) in enumerate(zip(before, truth))
+        }
+        slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW))
+        slam.tracker = TruePoses(poses.get)
+        for sample in before:
+            slam.process(sample)
+        for k, T in enumerate(truth[:-1]):
+            slam.trajectory.replace(k, T)
+        slam.tracker = TruePoses(tiny_sequence.true_pose)
+        slam.process(last, is_held_out=True)
+        assert isinstance(slam.mapper, GaussianMapper)
+        views = [slam.mapper.render(tiny_sequence.camera, T).depth for T in truth]
+        error = depth_l1_cm(views, [s.depth for s in tiny_samples])
+        assert error is not None
+        return error
+
+    clean, following = depth_error(share=0.0), depth_error()
+    monkeypatch.setattr(GaussianMapper, "_follow", lambda self, trajectory: None)
+    staying = depth_error()
+    assert following - clean < 0.5 * (staying - clean)
 
 
 def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
