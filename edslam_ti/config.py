@@ -122,6 +122,14 @@ class MappingConfig(Stage):
     """lambda_reg of Eq. 16 (paper: 0.25)."""
     max_scale_ratio: float = Field(10.0, ge=1)
     """r of Eq. 14: Gaussians may be this much longer than thick."""
+    densify: bool = False
+    """Clone, split and prune Gaussians by their gradients during the final steps (as gsplat does)."""
+    densify_every: int = Field(100, ge=1)
+    """Steps between two of these (gsplat: 100), in the first half of the final steps."""
+    densify_gradient: float = Field(2e-4, gt=0)
+    """Mean gradient in the image, in half image widths, from which on one Gaussian becomes two (gsplat)."""
+    opacity_reset_every: int = Field(3000, ge=1)
+    """With densify: final steps between two resets of all opacities to 0.01 (gsplat: 3000)."""
     log_epsilon: float = Field(0.004, gt=0)
     """Added to brightness before the logarithm of Eq. 10."""
     background: float = Field(0.5, gt=0, lt=1)

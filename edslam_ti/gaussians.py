@@ -132,11 +132,21 @@ class GaussianMap:
             "logit_opacities": torch.full((m,), opacity).logit(),
             "logit_colors": _logit(colors) - shared,
         }
-        for name, rows in new.items():
-            self._raw[name] = torch.cat([self._raw[name].detach(), rows]).requires_grad_()
-            self._moments[name] = Moments(
-                *(torch.cat([moment, torch.zeros_like(rows)]) for moment in self._moments[name])
-            )
+        self._append(new)
+
+    def clone(self, chosen: Tensor) -> Tensor:  # [M] indices -> [M] indices
+        """Append copies of some Gaussians, moments at zero; return where they are."""
+        n = len(self)
+        self._cells = torch.cat([self._cells, self._cells[chosen]])
+        self._frames = torch.cat([self._frames, self._frames[chosen]])
+        self._append({name: value.detach()[chosen] for name, value in self._raw.items()})
+        return torch.arange(n, len(self))
+
+    def overwrite(self, name: str, chosen: Tensor, values: Tensor) -> None:  # [M] indices, [M, ...]
+        """Set a raw parameter of some Gaussians; its moments begin anew."""
+        self._raw[name].detach()[chosen] = values.detach()
+        for moment in self._moments[name]:
+            moment[chosen] = 0
 
     def keep(self, mask: Tensor) -> None:
         """Keep the Gaussians where mask [N] is true."""
@@ -196,6 +206,14 @@ class GaussianMap:
         grid = torch.floor(means[:, None, :] / self._cell_sizes[:, None]).long()  # [M, L, 3]
         hashed = (grid * torch.tensor(CELL_PRIMES)).sum(-1) % CELL_TABLE
         return hashed + CELL_TABLE * torch.arange(len(self._cell_sizes))
+
+    def _append(self, new: dict[str, Tensor]) -> None:
+        """Append rows to every raw parameter; their moments start at zero."""
+        for name, rows in new.items():
+            self._raw[name] = torch.cat([self._raw[name].detach(), rows]).requires_grad_()
+            self._moments[name] = Moments(
+                *(torch.cat([moment, torch.zeros_like(rows)]) for moment in self._moments[name])
+            )
 
     def _map_rows(self, change: Callable[[Tensor], Tensor]) -> None:
         """Replace every table of one row a Gaussian."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.contrast import ContrastThreshold
+from edslam_ti.densification import Densifier
 from edslam_ti.event_images import EventImages, evenly
 from edslam_ti.frame import Frame
 from edslam_ti.gaussians import GaussianMap, Gaussians
@@ -191,6 +192,7 @@ class GaussianMapper:
         if len(self.gaussians) == 0 or not self._solve_brightness(trajectory, is_thorough=True):
             return
         allowed, done = self.budget.left(), 0.0
+        densifier = self._densifier(trajectory) if self._config.densify else None
         for k in range(self._config.final_iterations):
             if done >= 1:
                 break
@@ -198,7 +200,9 @@ class GaussianMapper:
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
             adjusts_poses = self._adjusts_poses and done >= ADJUST_FROM
-            self._optimise(self._draw_any(), trajectory, adjusts_poses)
+            self._optimise(self._draw_any(), trajectory, adjusts_poses, densifier)
+            if densifier is not None:
+                self._densify(densifier, k + 1)
             done = (k + 1) / self._config.final_iterations
             if allowed < math.inf:
                 done = max(done, 1 - self.budget.left() / allowed) if allowed > 0 else 1.0
@@ -297,6 +301,21 @@ class GaussianMapper:
             index,
         )
 
+    def _densifier(self, trajectory: Trajectory) -> Densifier:
+        positions = trajectory.poses[:, :3, 3]
+        means = self.gaussians.raw["means"].detach().numpy()
+        size = float(np.median(np.linalg.norm(means - positions.mean(0), axis=1)))
+        config = self._config
+        seed = int(self._random.integers(1 << 31))
+        return Densifier(self._camera, size, config.densify_gradient, config.max_gaussians, seed)
+
+    def _densify(self, densifier: Densifier, step: int) -> None:
+        config = self._config
+        if step % config.densify_every == 0 and step <= config.final_iterations // 2:
+            densifier.refine(self.gaussians)
+        if step % config.opacity_reset_every == 0:
+            densifier.reset_opacities(self.gaussians)
+
     def _prune(self) -> None:
         """Remove Gaussians that have faded."""
         keep = self.gaussians.raw["logit_opacities"].detach().sigmoid() > self._config.min_opacity
@@ -342,7 +361,13 @@ class GaussianMapper:
             level = np.log(gaussians.colors.numpy()[:, 0] + epsilon) + change
             self.gaussians.set_colors(torch.from_numpy((np.exp(level) - epsilon).astype(np.float32))[:, None])
 
-    def _optimise(self, index: int, trajectory: Trajectory, adjusts_poses: bool) -> None:
+    def _optimise(
+        self,
+        index: int,
+        trajectory: Trajectory,
+        adjusts_poses: bool,
+        densifier: Densifier | None = None,
+    ) -> None:
         """One step of Eq. 16 on one frame."""
         self.num_steps += 1
         config = self._config
@@ -370,6 +395,8 @@ class GaussianMapper:
             log_scales = part.raw["log_scales"]
             loss = loss + config.scale_weight * scale_loss(log_scales, config.max_scale_ratio)
         loss.backward()
+        if densifier is not None and (pull := part.raw["means"].grad) is not None:
+            densifier.observe(len(self.gaussians), chosen, part.raw["means"].detach(), pull, T)
         part.step()
         self.gaussians.take_over(part, chosen)
         for frame, delta in poses.deltas.items():

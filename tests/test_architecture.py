@@ -31,7 +31,12 @@ RANKS: list[list[str]] = [
             "edslam_ti.keyframes",
             "edslam_ti.event_images",
         ),
-        *("edslam_ti.pose_graph", "edslam_ti.brightness_tracking", "edslam_ti.mapping"),
+        *(
+            "edslam_ti.pose_graph",
+            "edslam_ti.brightness_tracking",
+            "edslam_ti.densification",
+            "edslam_ti.mapping",
+        ),
     ],
     ["edslam_ti.slam"],
     [

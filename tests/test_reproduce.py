@@ -28,6 +28,7 @@ from edslam_ti.reproduce.ablations import (
 )
 from edslam_ti.reproduce.altered import AlteredSequence, RepeatedSequence
 from edslam_ti.reproduce.cases import Case, Recording, Selection, all_cases, quick_cases
+from edslam_ti.reproduce.long_stream import FrameCost, measure, stretches, table
 from edslam_ti.reproduce.recordings import Recordings
 from edslam_ti.reproduce.report import insert_into, markdown, write_report
 from edslam_ti.reproduce.runs import Variant, methods_as_variants, result_file, run_all
@@ -91,6 +92,25 @@ def test_a_loop_is_played_again_where_it_ended(tmp_path: Path) -> None:
     assert len(across) == len(once.events(0.35, 0.4)) + len(once.events(0.0, 0.05))
     assert (np.diff(across.t) >= 0).all()
     assert len(SampledSequence(twice, 0.0, None, 0.05)) == 2 * len(SampledSequence(once, 0.0, None, 0.05))
+
+
+def test_long_stream_reports_what_frames_cost(tiny_sequence: EventDepthSequence, tmp_path: Path) -> None:
+    config = Config(duration=0.4).updated({"mapping": {"iterations": 1}})
+    lines: list[str] = []
+    measure(tiny_sequence, config, tmp_path, length=0.2, report=lines.append)
+    rows = (tmp_path / "frames.csv").read_text().splitlines()
+    num_frames = len(SampledSequence(tiny_sequence, 0.0, 0.4, config.max_interval))
+    assert len(rows) == 1 + num_frames
+    assert float(rows[-1].split(",")[4]) > 100  # MB: Python and torch are there
+    text = (tmp_path / "long_stream.md").read_text()
+    assert all(line in text for line in lines)
+    assert (tmp_path / "long_stream.png").stat().st_size > 1000
+
+
+def test_growth_is_counted_from_the_warm_up_on() -> None:
+    costs = [FrameCost(t, 0.2 if t < 15 else 0.3, 0.1, 0.1, 500 + t, int(1000 * t)) for t in range(20)]
+    text = table(stretches(costs, length=5.0))
+    assert "Since 10 s: +10 MB with +10000 Gaussians, CPU time a frame +50 %." in text
 
 
 def test_a_path_that_does_not_close_is_not_played_again(tiny_sequence: EventDepthSequence) -> None:

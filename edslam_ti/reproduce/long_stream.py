@@ -56,8 +56,6 @@ class Stretch:
     start: float  # seconds of data
     end: float
     cpu_s: float  # a frame
-    tracking_s: float  # a frame
-    mapping_s: float  # a frame
     memory_mb: float
     num_gaussians: int
 
@@ -72,8 +70,6 @@ def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
             k * length,
             (k + 1) * length,
             float(np.mean([c.cpu_s for c in part])),
-            float(np.mean([c.tracking_s for c in part])),
-            float(np.mean([c.mapping_s for c in part])),
             part[-1].memory_mb,
             part[-1].num_gaussians,
         )
@@ -82,10 +78,13 @@ def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
 
 
 def table(rows: Sequence[Stretch]) -> str:
-    """Return Markdown: a line for every stretch, then what has grown since the warm-up."""
+    """Return Markdown: a line for every stretch, then what has grown since the warm-up.
+
+    CPU time of all threads: wall time says more about what else the machine does.
+    """
     lines = [
-        "| seconds of data | Gaussians | resident MB | CPU s a frame | tracking, wall s | mapping, wall s |",
-        "|---|---|---|---|---|---|",
+        "| seconds of data | Gaussians | resident MB | CPU s a frame |",
+        "|---|---|---|---|",
     ]
     lines += [_line(row) for row in rows]
     warm = [r for r in rows if r.end <= WARM_UP]
@@ -103,7 +102,7 @@ def table(rows: Sequence[Stretch]) -> str:
 def _line(row: Stretch) -> str:
     return (
         f"| {row.start:g} to {row.end:g} | {row.num_gaussians / 1000:.0f}k | {row.memory_mb:.0f} | "
-        f"{row.cpu_s:.2f} | {row.tracking_s:.3f} | {row.mapping_s:.3f} |"
+        f"{row.cpu_s:.2f} |"
     )
 
 
@@ -112,18 +111,16 @@ def plot(path: Path, rows: Sequence[Stretch]) -> None:
     figure = new_figure(9, 3.2)
     seconds, memory = figure.subplots(1, 2)
     middle = [(r.start + r.end) / 2 for r in rows]
-    seconds.plot(middle, [r.cpu_s for r in rows], "o-", label="CPU, all")
-    seconds.plot(middle, [r.mapping_s for r in rows], "s-", label="wall, mapping")
-    seconds.plot(middle, [r.tracking_s for r in rows], "^-", label="wall, tracking")
-    seconds.set_ylabel("seconds a frame")
+    seconds.plot(middle, [r.cpu_s for r in rows], "o-")
+    seconds.set_ylabel("CPU seconds a frame")
     memory.plot([r.end for r in rows], [r.memory_mb for r in rows], "o-", label="resident MB")
     memory.plot(
         [r.end for r in rows], [r.num_gaussians / 1000 for r in rows], "s-", label="thousand Gaussians"
     )
+    memory.legend(fontsize=8)
     for ax in (seconds, memory):
         ax.set_xlabel("seconds of data")
         ax.set_ylim(bottom=0)
-        ax.legend(fontsize=8)
         ax.grid(alpha=0.3)
     save_figure(figure, path)
 
