@@ -155,21 +155,22 @@ class GaussianMap:
     @torch.no_grad()
     def follow(self, corrections: Mapping[int, np.ndarray]) -> None:  # [4, 4] by frame, T_new T_old^-1
         """Move the Gaussians from every frame's depth as its pose has been moved."""
-        last = int(self._frames.max()) if len(self) else 0
-        of_frames = np.tile(np.eye(4), (last + 1, 1, 1))
-        for frame, correction in corrections.items():
-            if frame <= last:
-                of_frames[frame] = correction
+        frames = torch.tensor(sorted(corrections), dtype=torch.int64)
+        chosen = torch.nonzero(torch.isin(self._frames, frames)).squeeze(1)
+        if len(chosen) == 0:
+            return
+        of_frames = np.array([corrections[k] for k in frames.tolist()])  # [F, 4, 4]
         turns = Rotation.from_matrix(of_frames[:, :3, :3]).as_quat(scalar_first=True)
-        T = torch.from_numpy(of_frames).float()[self._frames]  # [N, 4, 4]
-        w, x, y, z = torch.from_numpy(turns).float()[self._frames].unbind(-1)
-        means, (a, b, c, d) = self._raw["means"], self._raw["quats"].unbind(-1)
-        means.copy_((T[:, :3, :3] @ means[..., None])[..., 0] + T[:, :3, 3])
+        at = torch.searchsorted(frames, self._frames[chosen])
+        T, q = torch.from_numpy(of_frames).float()[at], torch.from_numpy(turns).float()[at]
+        means = self._raw["means"][chosen]
+        self._raw["means"][chosen] = (T[:, :3, :3] @ means[..., None])[..., 0] + T[:, :3, 3]
+        (w, x, y, z), (a, b, c, d) = q.unbind(-1), self._raw["quats"][chosen].unbind(-1)
         turned = (
             *(w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c),
             *(w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a),
         )  # the turn's quaternion times the Gaussian's
-        self._raw["quats"].copy_(torch.stack(turned, -1))
+        self._raw["quats"][chosen] = torch.stack(turned, -1)
 
     def set_colors(self, colors: Tensor) -> None:  # [N, 1] in (0, 1)
         """Overwrite every Gaussian's brightness; the cells keep theirs."""
