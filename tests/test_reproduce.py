@@ -78,28 +78,28 @@ def test_altered_sequence_thins_depth_and_cuts_gaps(tiny_sequence: EventDepthSeq
 
 
 def test_a_loop_is_played_again_where_it_ended(tmp_path: Path) -> None:
-    settings = TINY.model_copy(update={"path": "loop", "duration": 0.4})
+    settings = TINY.model_copy(update={"path": "loop", "duration": 0.2, "width": 48, "height": 32})
     room = tiny_room()
     simulate(room.scene, make_path(room, settings), settings, tmp_path / "loop")
     once = EventReplicaSequence(tmp_path / "loop")
     twice = RepeatedSequence(once, 2)
     stamps = once.depth_timestamps
-    np.testing.assert_allclose(twice.depth_timestamps, [*stamps, *(stamps[1:] + 0.4)])
+    np.testing.assert_allclose(twice.depth_timestamps, [*stamps, *(stamps[1:] + 0.2)])
     np.testing.assert_array_equal(twice.depth(len(stamps)), once.depth(1))
     assert twice.truth is not None
-    np.testing.assert_allclose(twice.truth.at(0.5), twice.truth.at(0.1), atol=1e-9)
-    across = twice.events(0.35, 0.45)
-    assert len(across) == len(once.events(0.35, 0.4)) + len(once.events(0.0, 0.05))
+    np.testing.assert_allclose(twice.truth.at(0.25), twice.truth.at(0.05), atol=1e-9)
+    across = twice.events(0.15, 0.25)
+    assert len(across) == len(once.events(0.15, 0.2)) + len(once.events(0.0, 0.05))
     assert (np.diff(across.t) >= 0).all()
     assert len(SampledSequence(twice, 0.0, None, 0.05)) == 2 * len(SampledSequence(once, 0.0, None, 0.05))
 
 
 def test_long_stream_reports_what_frames_cost(tiny_sequence: EventDepthSequence, tmp_path: Path) -> None:
-    config = Config(duration=0.4).updated({"mapping": {"iterations": 1}})
+    config = Config(duration=0.2, poses="truth").updated({"mapping": {"iterations": 1}})
     lines: list[str] = []
-    measure(tiny_sequence, config, tmp_path, length=0.2, report=lines.append)
+    measure(tiny_sequence, config, tmp_path, length=0.1, report=lines.append)
     rows = (tmp_path / "frames.csv").read_text().splitlines()
-    num_frames = len(SampledSequence(tiny_sequence, 0.0, 0.4, config.max_interval))
+    num_frames = len(SampledSequence(tiny_sequence, 0.0, 0.2, config.max_interval))
     assert len(rows) == 1 + num_frames
     assert float(rows[-1].split(",")[4]) > 100  # MB: Python and torch are there
     text = (tmp_path / "long_stream.md").read_text()
