@@ -12,6 +12,7 @@ from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 from edslam_ti.keyframes import EventArchive
+from edslam_ti.pointcloud import with_holes_filled
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
@@ -154,7 +155,9 @@ class EventImages:
 
     def _view(self, index: int, trajectory: Trajectory, is_relative: bool) -> EventView:
         change = self._change(index) if is_relative else self.log_brightness(index)
-        return EventView(change, self._depths[index], trajectory.pose(index), is_relative)
+        measured = self._depths[index]
+        depth = None if measured is None else with_holes_filled(measured)
+        return EventView(change, depth, trajectory.pose(index), is_relative)
 
 
 def evenly(frames: list[int], most: int) -> list[int]:

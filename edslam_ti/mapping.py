@@ -19,7 +19,7 @@ from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
-from edslam_ti.pointcloud import depth_to_points, surface_discs
+from edslam_ti.pointcloud import depth_to_points, surface_discs, with_holes_filled
 from edslam_ti.rendering import RenderOutput, View, drawable, render, render_view
 from edslam_ti.trajectory import Trajectory
 
@@ -266,15 +266,17 @@ class GaussianMapper:
         T_world_camera: np.ndarray,  # [4, 4]
         view: RenderOutput,
     ) -> None:
-        """Add Gaussians at the pixels that Eq. 13 selects, one per stride x stride block."""
+        """Add Gaussians at the pixels that Eq. 13 selects, one per stride x stride block.
+
+        So are pixels without depth where the map shows nothing, at the depth that is assumed there.
+        """
         config = self._config
+        alpha = view.alpha.numpy()
         mask = densify_mask(
-            view.alpha.numpy(),
-            view.expected_depth.numpy(),
-            depth,
-            config.min_visibility,
-            config.depth_error_factor,
+            alpha, view.expected_depth.numpy(), depth, config.min_visibility, config.depth_error_factor
         )
+        mask |= (depth <= 0) & (alpha < config.min_visibility)
+        depth = with_holes_filled(depth)
         s = stride_in_room(config.pixel_stride, len(self.gaussians) / config.max_gaussians)
         grid = np.zeros_like(mask)
         grid[s // 2 :: s, s // 2 :: s] = True

@@ -1,11 +1,15 @@
 """Depth images to points (Open3D)."""
 
+import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
 from edslam_ti.open3d_loader import load_open3d
 
+HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
+FAR_SIDE = 90  # percentile of the depth around a hole
+BEHIND = 1.25  # times that is assumed in it: what is too near would hide surfaces measured later
 FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
 
 
@@ -68,6 +72,31 @@ def surface_discs(
     x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3] @ axes).as_quat().T
     stretch = 1 / np.maximum(cosine, 1 / max_stretch)
     return np.stack([w, x, y, z], -1).astype(np.float32), stretch.astype(np.float32)
+
+
+def with_holes_filled(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+    """Return depth with large holes put behind the far side of what surrounds them.
+
+    A sensor sees nothing in windows and beyond its range; something is there all the same, and it is not in
+    front. Narrow holes (shadows of the sensor's projector, noise at edges) stay: another view sees them.
+    """
+    missing = (depth <= 0).astype(np.uint8)
+    holes = cv2.morphologyEx(missing, cv2.MORPH_OPEN, np.ones((HOLE_WIDTH, HOLE_WIDTH), np.uint8))
+    filled = depth.copy()
+    number, labels, boxes, _ = cv2.connectedComponentsWithStats(holes)
+    reach = 2 * (HOLE_WIDTH // 2) + 1  # beyond what opening has removed of the rim
+    for label in range(1, number):
+        left, top, width, height, _ = boxes[label]
+        box = np.s_[max(top - reach, 0) : top + height + reach, max(left - reach, 0) : left + width + reach]
+        hole = (labels[box] == label).astype(np.uint8)
+        near = cv2.dilate(hole, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        around = depth[box][near & (depth[box] > 0)]
+        if len(around):
+            gap = near & (depth[box] <= 0)
+            filled[box][gap] = BEHIND * np.percentile(around, FAR_SIDE)
+    return filled
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:  # [N, 3]

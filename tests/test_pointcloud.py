@@ -5,7 +5,7 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.pointcloud import depth_to_points, surface_discs
+from edslam_ti.pointcloud import depth_to_points, surface_discs, with_holes_filled
 
 CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
 
@@ -92,3 +92,16 @@ def test_disc_beside_missing_depth_or_an_edge_faces_the_camera() -> None:
     np.testing.assert_allclose(stretch, 1.0)
     _, stretch = surface_discs(depth, camera, np.eye(4), np.array([[2, 2]]), max_stretch=4.0)
     assert stretch[0] > 1  # seen from the side
+
+
+def test_large_holes_lie_behind_what_surrounds_them_and_narrow_ones_stay() -> None:
+    depth = np.full((60, 80), 2.0, np.float32)
+    depth[:, 40:] = 3.0
+    depth[10:40, 30:60] = 0  # a window
+    depth[50, :] = 0  # a line that the sensor missed
+    filled = with_holes_filled(depth)
+    assert filled[10:40, 30:60] == pytest.approx(1.25 * 3.0)
+    assert (filled[50] == 0).all()
+    measured = depth > 0
+    assert (filled[measured] == depth[measured]).all()
+    assert (with_holes_filled(np.zeros_like(depth)) == 0).all()  # nothing to go by
