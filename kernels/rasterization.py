@@ -219,8 +219,8 @@ class _Rasterize(torch.autograd.Function):
         projection = pixels.project(*inputs) if pixelwise else project(*inputs)
         lists = (pixels.list_pairs if pixelwise else list_pairs)(projection, size, tile)
         blocks = (len(lists.start) - 1) * (tile // BLOCK) ** 2
-        values = torch.empty(1 + channels, blocks, LANES, dtype=float_dtype(), device=device)
-        transmittance = torch.empty(blocks, LANES, dtype=float_dtype(), device=device)
+        drawn = torch.empty(2 + channels, blocks, LANES, dtype=float_dtype(), device=device)
+        values, transmittance = drawn[:-1], drawn[-1]
         last, front = (torch.empty(blocks, LANES, dtype=torch.int32, device=device) for _ in range(2))
         visible = torch.zeros(projection.padded, dtype=torch.uint8, device=device)
         if pixelwise:
@@ -235,19 +235,19 @@ class _Rasterize(torch.autograd.Function):
             )  # fmt: skip
         ctx.projection, ctx.lists, ctx.size, ctx.pixelwise = projection, lists, size, pixelwise
         ctx.transmittance, ctx.last = transmittance, last
-        planes = from_blocks(values, size, tile)
-        alpha = 1 - from_blocks(transmittance[None], size, tile)[0]
+        planes = from_blocks(drawn, size, tile)
         dominant = from_blocks(front[None], size, tile)[0].contiguous()
         visible = visible[:count].bool()
         ctx.mark_non_differentiable(visible, dominant)
-        return planes[1:].permute(1, 2, 0), planes[0], alpha, visible, dominant
+        return planes[1:-1].permute(1, 2, 0), planes[0], 1 - planes[-1], visible, dominant
 
     @staticmethod
     def backward(ctx, grad_image, grad_depth, grad_alpha, _visible, _dominant):
         projection: Projection = ctx.projection
         lists: TileLists = ctx.lists
-        grad_values = to_blocks(torch.cat([grad_depth[None], grad_image.permute(2, 0, 1)]), lists.tile)
-        grad_rest = to_blocks(grad_alpha[None], lists.tile)[0]
+        grad_images = torch.cat([grad_depth[None], grad_image.permute(2, 0, 1), grad_alpha[None]])
+        grad_drawn = to_blocks(grad_images, lists.tile)
+        grad_values, grad_rest = grad_drawn[:-1], grad_drawn[-1]
         if ctx.pixelwise:
             slot_grad = pixels.draw_lists_backward(
                 projection, lists, ctx.size[0], ctx.transmittance, ctx.last, grad_values, grad_rest
