@@ -32,6 +32,8 @@ RANKS: list[list[str]] = [
             "edslam_ti.event_images",
         ),
         *(
+            "edslam_ti.keyframe_alignment",
+            "edslam_ti.place_recognition",
             "edslam_ti.pose_graph",
             "edslam_ti.brightness_tracking",
             "edslam_ti.densification",
@@ -71,7 +73,7 @@ LIBRARIES: dict[str, list[str]] = {
     "cv2": [
         *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.pictures"),
         *("edslam_ti.brightness", "edslam_ti.contrast", "edslam_ti.event_images"),
-        *("edslam_ti.brightness_tracking", "edslam_ti.pointcloud"),
+        *("edslam_ti.keyframe_alignment", "edslam_ti.place_recognition", "edslam_ti.pointcloud"),
     ],
     "OpenEXR": ["edslam_ti.datasets.*"],
     "platformdirs": ["edslam_ti.datasets.*"],
