@@ -29,6 +29,7 @@ DARKEST, BRIGHTEST = 0.1, 0.98  # grey values that are neither lost in 8 bits no
 MIN_EVENTS = 400  # of either polarity
 LEAN = 0.25  # thresholds that brightness is beyond the last event, in its direction, on average
 HISTORY = 0.3  # seconds before a pair in which the last event of a pixel is looked for
+MIN_DIFFERENCE = 0.05  # of C+ and C-; smaller ones are within the errors of the estimate
 LOG_EPSILON = 0.004
 RING = 5  # px; pixels of this square around a pixel, without the inner 3 x 3, are its instruments
 
@@ -45,8 +46,10 @@ class ContrastThreshold:
 
     @property
     def relative(self) -> tuple[float, float]:
-        """Return the positive and the negative threshold divided by `value`; 1 where they are not known."""
+        """Return the positive and the negative threshold divided by `value`; 1 unless they differ."""
         if self.positive is None or self.negative is None:
+            return 1.0, 1.0
+        if abs(self.positive - self.negative) < MIN_DIFFERENCE * self.value:
             return 1.0, 1.0
         return self.positive / self.value, self.negative / self.value
 

@@ -45,8 +45,8 @@ class EventArchive:
         positive: float = 1.0,  # what an event of either polarity stands for, in (mean) thresholds
         negative: float = 1.0,
     ) -> None:
-        self._worth = {1: round(self.STEPS * positive), -1: -round(self.STEPS * negative)}  # units
-        self._level = np.zeros(shape, np.int16)  # units, of events since the beginning
+        self._worth = {1: self.STEPS * positive, -1: -self.STEPS * negative}  # units, not rounded: sums grow
+        self._level = np.zeros(shape, np.float32)  # units, of events since the beginning
         self._last = np.zeros(shape, np.int16)  # units, towards which the last event leans
         self._last_frame = np.zeros(shape, np.int32)  # frames up to this one know their next event
         self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
@@ -73,11 +73,13 @@ class EventArchive:
             events_of = events.polarity == polarity
             x, y = events.x[events_of], events.y[events_of]
             ones = np.ones(len(x), np.int8)
-            self._level += worth * accumulate_polarity(x, y, ones, np.array([0, len(x)]), shape)[0]
+            self._level += (
+                np.float32(worth) * accumulate_polarity(x, y, ones, np.array([0, len(x)]), shape)[0]
+            )
         self._last.ravel()[pixel] = lean  # of repeated pixels the last one stays
         self._last_frame.ravel()[fired] = index
         if is_kept:
-            self._images[index] = self._level + self._last
+            self._images[index] = np.rint(self._level).astype(np.int16) + self._last
 
     def _lean_towards_next(self, pixels: np.ndarray, lean: np.ndarray) -> None:
         """Let the kept images since each pixel's last event, mostly few, lean [P] towards its next one."""

@@ -105,3 +105,10 @@ def test_counting_begins_again_where_it_ended(archive: EventArchive, events: Eve
 def test_forgotten_frames_are_gone(archive: EventArchive) -> None:
     archive.forget(1)
     assert archive.frames == [0, 3]
+
+
+def test_thresholds_that_hardly_differ_are_not_rounded() -> None:
+    archive = EventArchive((2, 2), positive=1.01, negative=0.99)
+    x, t = np.zeros(200, np.int16), np.arange(200) / 200
+    archive.append(Events(x, x, t, np.tile(np.array([1, -1], np.int8), 100)), 0, is_kept=True)
+    assert archive.change(0)[0, 0] == pytest.approx(100 * (1.01 - 0.99), abs=0.25)  # less the lean
