@@ -2,11 +2,13 @@
 
 import gc
 
+_was_enabled = gc.isenabled()
+gc.disable()  # importing torch would look 380 times for garbage among what it has just made
 try:
-    gc.disable()  # importing torch would look 380 times for garbage among what it has just made
     from kernels.runtime import init
 finally:
-    gc.enable()
+    if _was_enabled:
+        gc.enable()
 
 __project__ = "edslam_ti"  # `kernels` is also the name of an unrelated PyPI package
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from kernels import brightness_image, patch_warp, reference
+from kernels import brightness_image, depth_average, patch_warp, reference
 from kernels import time_surface as surfaces
 from kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from kernels.patch_warp import (
@@ -483,7 +483,7 @@ def run_every_kernel() -> None:
     scene = [x.detach() for x in inputs[:-1]]
     compare_change(*scene, poses, intrinsics, (16, 12), target, 0.5, 0.01, 1.0)
     compare_view(*scene, poses[0], intrinsics, (16, 12), target, target, 0.5, 0.01, 1.0, 1.0)
-    for module in (patch_warp, brightness_image, surfaces):
+    for module in (patch_warp, brightness_image, depth_average, surfaces):
         module.compile_kernels()
     x, t = np.zeros(MANY_EVENTS, np.int16), np.zeros(MANY_EVENTS)
     update_last_timestamps(x, x, t, np.zeros((1, 1)))
