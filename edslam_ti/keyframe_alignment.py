@@ -24,7 +24,7 @@ from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, R
 
 IMAGE_WIDTH = 192  # pixels, roughly
 COARSE_STEPS = 6  # Levenberg-Marquardt steps a level; twice as many without depth
-SMALL_GAIN = 0.01  # relative decrease of the cost: near enough for the next, finer level
+SMALL_GAIN = 1e-3  # relative decrease of the cost: near enough for the next, finer level
 STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
 MAX_MISFIT = 0.25  # log brightness, median: beyond, the image is not that of the keyframe's surfaces
 
