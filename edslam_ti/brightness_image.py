@@ -32,23 +32,27 @@ class BrightnessChange:
     per pixel trails by C / 2g pixels, which biases alignment.
     """
 
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self._sum = np.zeros(shape, np.int32)
+    def __init__(self, shape: tuple[int, int], positive: float, negative: float) -> None:
+        """`positive` and `negative` are the sensor's thresholds C+ and C-, in log brightness."""
+        self._thresholds = np.float32(positive), np.float32(negative)
+        self._counts = np.zeros((2, *shape), np.int32)  # negative and positive events
         self._last = np.zeros(shape, np.int8)  # polarity of the last event
 
     def add(self, events: Events) -> None:
         """Add events that follow those added before."""
-        time_surface.add_polarity(events.x, events.y, events.polarity, self._sum, self._last)
+        time_surface.count_events(events.x, events.y, events.polarity, self._counts, self._last)
 
-    def log_brightness(self, contrast_threshold: float) -> np.ndarray:  # [H, W] float32
+    def log_brightness(self) -> np.ndarray:  # [H, W] float32
         """Return the change since the beginning."""
-        steps = self._sum.astype(np.float32)
-        steps += np.float32(HYSTERESIS) * self._last
-        return np.float32(contrast_threshold) * steps
+        positive, negative = self._thresholds
+        beyond = np.float32(HYSTERESIS)
+        fell = self._counts[0].astype(np.float32) + beyond * (self._last < 0)
+        rose = self._counts[1].astype(np.float32) + beyond * (self._last > 0)
+        return positive * rose - negative * fell
 
     def reset(self) -> None:
         """Begin anew."""
-        self._sum[:], self._last[:] = 0, 0
+        self._counts[:], self._last[:] = 0, 0
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from edslam_ti.brightness_image import BrightnessChange
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
+from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import exp_matrix, is_near, log_vector, rigid_inverse
 from edslam_ti.keyframe_alignment import Aligned, BrightnessKeyframe, Depth, KeyframeAligner, Moment
@@ -47,12 +48,13 @@ class BrightnessTracker:
     keyframe comes into view again, the drift since then is taken back.
     """
 
-    def __init__(self, camera: Camera, contrast_threshold: float, config: TrackingConfig, seed: int) -> None:
+    def __init__(
+        self, camera: Camera, contrast: ContrastThreshold, config: TrackingConfig, seed: int
+    ) -> None:
         self._config = config
         self._aligner = KeyframeAligner(camera, config, seed)
-        self._contrast_threshold = contrast_threshold
         self._surface_tracker = BidirectionalPatchTracker(config, seed)
-        self._change = BrightnessChange(camera.shape)
+        self._change = BrightnessChange(camera.shape, *(contrast.value * c for c in contrast.relative))
         self._stretch_start = 0  # first frame of the stretch of uninterrupted events
         self._moments: list[Moment] = []  # the last frames of the stretch
         self._keyframe: BrightnessKeyframe | None = None  # None: no image yet
@@ -93,8 +95,7 @@ class BrightnessTracker:
 
     def _take_in(self, frame: Frame, index: int) -> Moment:
         self._change.add(frame.events)
-        change = self._change.log_brightness(self._contrast_threshold)
-        moment = self._aligner.moment(index, frame, change)
+        moment = self._aligner.moment(index, frame, self._change.log_brightness())
         self._moments = [*self._moments, moment][-WINDOW:]
         return moment
 

@@ -66,6 +66,7 @@ class GaussianMap:
         self._moments = {name: Moments.zeros_like(value) for name, value in empty.items()}
         self._steps = 0
         self._frames = torch.empty(0, dtype=torch.int64)  # [N] whose depth each is from
+        self._is_measured = torch.empty(0, dtype=torch.bool)  # [N] that depth was not assumed
         self._cell_sizes = torch.tensor(config.brightness_cells)
         self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
         self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
@@ -102,6 +103,12 @@ class GaussianMap:
         part._map_rows(lambda table: table.index_select(0, chosen))
         return part
 
+    def measured(self) -> "GaussianMap":
+        """Return the Gaussians on measured surfaces, without those at assumed depth."""
+        if bool(self._is_measured.all()):
+            return self
+        return self.part(torch.nonzero(self._is_measured).squeeze(1))
+
     def take_over(self, part: "GaussianMap", chosen: Tensor) -> None:  # [M] indices, as given to `part`
         """Overwrite the chosen Gaussians and their moments with those of a part."""
         for name, value in self._raw.items():
@@ -118,9 +125,12 @@ class GaussianMap:
         opacity: float,
         colors: Tensor,  # [M, 1] in (0, 1)
         frame: int = 0,  # whose depth they are from
+        is_measured: Tensor | None = None,  # [M] bool: that depth was not assumed; None: all
     ) -> None:
         """Append Gaussians; their optimiser moments start at zero."""
         m = len(means)
+        is_measured = torch.ones(m, dtype=torch.bool) if is_measured is None else is_measured
+        self._is_measured = torch.cat([self._is_measured, is_measured])
         self._frames = torch.cat([self._frames, torch.full((m,), frame)])
         cells = self._cells_of(means)
         shared = self._cell_table.detach()[cells].sum(-1, keepdim=True)
@@ -139,6 +149,7 @@ class GaussianMap:
         n = len(self)
         self._cells = torch.cat([self._cells, self._cells[chosen]])
         self._frames = torch.cat([self._frames, self._frames[chosen]])
+        self._is_measured = torch.cat([self._is_measured, self._is_measured[chosen]])
         self._append({name: value.detach()[chosen] for name, value in self._raw.items()})
         return torch.arange(n, len(self))
 
@@ -219,6 +230,7 @@ class GaussianMap:
     def _map_rows(self, change: Callable[[Tensor], Tensor]) -> None:
         """Replace every table of one row a Gaussian."""
         self._cells, self._frames = change(self._cells), change(self._frames)
+        self._is_measured = change(self._is_measured)
         self._raw = {name: change(value.detach()).requires_grad_() for name, value in self._raw.items()}
         self._moments = {name: Moments(*map(change, pair)) for name, pair in self._moments.items()}
 

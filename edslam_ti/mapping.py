@@ -53,8 +53,8 @@ class Mapper(Protocol):
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
         """Last refinement after the last frame; may correct poses."""
 
-    def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
-        """Return the map seen from a pose [4, 4]."""
+    def render(self, camera: Camera, T_world_camera: np.ndarray, measured_only: bool = False) -> View:
+        """Return the map seen from a pose [4, 4]; `measured_only`: without surfaces that are assumed."""
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return points [N, 3] (metres, world) and their brightness [N] in [0, 1]."""
@@ -210,9 +210,10 @@ class GaussianMapper:
                 break
         self._prune()
 
-    def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
-        """Return the map seen from a pose."""
-        return render_view(self.gaussians, camera, T_world_camera, self._config.background)
+    def render(self, camera: Camera, T_world_camera: np.ndarray, measured_only: bool = False) -> View:
+        """Return the map seen from a pose; `measured_only`: without Gaussians at assumed depth."""
+        gaussians = self.gaussians.measured() if measured_only else self.gaussians
+        return render_view(gaussians, camera, T_world_camera, self._config.background)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the Gaussians' centres and brightness."""
@@ -276,7 +277,7 @@ class GaussianMapper:
             alpha, view.expected_depth.numpy(), depth, config.min_visibility, config.depth_error_factor
         )
         mask |= (depth <= 0) & (alpha < config.min_visibility)
-        depth = with_holes_filled(depth)
+        is_measured, depth = depth > 0, with_holes_filled(depth)
         s = stride_in_room(config.pixel_stride, len(self.gaussians) / config.max_gaussians)
         grid = np.zeros_like(mask)
         grid[s // 2 :: s, s // 2 :: s] = True
@@ -301,6 +302,7 @@ class GaussianMapper:
             config.initial_opacity,
             torch.from_numpy(brightness.astype(np.float32))[:, None],
             index,
+            torch.from_numpy(is_measured[y, x]),
         )
 
     def _densifier(self, trajectory: Trajectory) -> Densifier:

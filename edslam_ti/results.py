@@ -441,7 +441,7 @@ def _write_map(state: Run, mapper: Mapper, folder: Path) -> Any | None:
 
     def views() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         for T in state.slam.trajectory.spread(MESH_STEP, MESH_TURN):
-            view = mapper.render(state.sequence.camera, T)
+            view = mapper.render(state.sequence.camera, T, measured_only=True)
             opaque = np.where(view.alpha > MESH_ALPHA, view.depth, 0)
             yield without_depth_edges(opaque), view.intensity, T
 

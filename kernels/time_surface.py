@@ -68,16 +68,17 @@ def _accumulate_polarity(
 
 
 @ti.kernel
-def _add_polarity(
+def _count_events(
     x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N]
-    total: ti.types.ndarray(ti.i32, ndim=2),  # in and out [H, W]
+    counts: ti.types.ndarray(ti.i32, ndim=3),  # in and out [2, H, W]
     last: ti.types.ndarray(ti.i8, ndim=2),  # in and out [H, W]
 ):
     ti.loop_config(serialize=True)  # the last event wins
     for i in range(x.shape[0]):
-        total[y[i], x[i]] = total[y[i], x[i]] + polarity[i]
+        sign = ti.select(polarity[i] > 0, 1, 0)
+        counts[sign, y[i], x[i]] = counts[sign, y[i], x[i]] + 1
         last[y[i], x[i]] = polarity[i]
 
 
@@ -162,26 +163,26 @@ def accumulate_polarity(
     return sums
 
 
-def add_polarity(
+def count_events(
     x: np.ndarray,  # [N] int16
     y: np.ndarray,  # [N] int16
     polarity: np.ndarray,  # [N] int8, -1 or +1, in order of time
-    total: np.ndarray,  # [H, W] int32, changed in place: sum of polarities
+    counts: np.ndarray,  # [2, H, W] int32, changed in place: negative and positive events
     last: np.ndarray,  # [H, W] int8, changed in place: polarity of the newest event
 ) -> None:
-    """Add events to a running sum of polarities (Eq. 11), and note each pixel's newest one."""
+    """Add events to each pixel's numbers of either polarity, and note its newest one."""
     check_shape("y", y, x.shape)
     check_shape("polarity", polarity, x.shape)
-    check_shape("last", last, total.shape)
+    check_shape("counts", counts, (2, *last.shape))
     if len(x):
-        _check_inside(x, y, total.shape)
-        _add_polarity(x, y, polarity, total, last)
+        _check_inside(x, y, last.shape)
+        _count_events(x, y, polarity, counts, last)
 
 
 def compile_kernels() -> None:
     """Compile what a running sum needs, so that the first frame of a sequence need not wait for it."""
     place, one = np.zeros(1, np.int16), np.ones(1, np.int8)
-    add_polarity(place, place, one, np.zeros((1, 1), np.int32), np.zeros((1, 1), np.int8))
+    count_events(place, place, one, np.zeros((2, 1, 1), np.int32), np.zeros((1, 1), np.int8))
 
 
 def _check_inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> None:

@@ -120,6 +120,20 @@ def test_a_part_is_optimised_as_the_whole_would_be_and_the_rest_stays() -> None:
         assert torch.equal(value[1::2], before[name][1::2]), name
 
 
+def test_gaussians_at_assumed_depth_can_be_left_out() -> None:
+    gaussians = GaussianMap(CONFIG)
+    add(gaussians, 3)
+    assert gaussians.measured() is gaussians
+    tables = [torch.full((2, 3), 7.0), upright(2), torch.full((2, 3), 0.1)]
+    gaussians.add(*tables, 0.5, torch.full((2, 1), 0.5), 1, torch.tensor([False, True]))
+    gaussians.keep(torch.tensor([True, False, True, True, True]))
+    gaussians.clone(torch.tensor([2]))  # the assumed one
+    assert len(gaussians) == 5
+    measured = gaussians.measured()
+    assert len(measured) == 3
+    torch.testing.assert_close(measured.raw["means"], gaussians.raw["means"][[0, 1, 3]])
+
+
 def test_gaussians_follow_the_frame_they_are_from() -> None:
     gaussians = GaussianMap(CONFIG)
     for frame in (3, 8):

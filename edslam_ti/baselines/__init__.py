@@ -32,7 +32,7 @@ def _ed_slam(
 
     tracker: Tracker
     if config.tracking.brightness:
-        tracker = BrightnessTracker(sequence.camera, contrast.value, config.tracking, config.seed)
+        tracker = BrightnessTracker(sequence.camera, contrast, config.tracking, config.seed)
     else:
         tracker = BidirectionalPatchTracker(config.tracking, config.seed)
     return tracker, GaussianMapper(sequence.camera, contrast, config)

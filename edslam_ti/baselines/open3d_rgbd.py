@@ -127,7 +127,7 @@ class TsdfMapper:
         """Nothing is left to refine."""
         progress(1.0)
 
-    def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
+    def render(self, camera: Camera, T_world_camera: np.ndarray, measured_only: bool = False) -> View:
         """Return the fused surface seen from a pose."""
         if self._view is None:
             self._view = MeshView(self._volume.mesh())
