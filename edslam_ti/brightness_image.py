@@ -35,7 +35,7 @@ class BrightnessChange:
     def __init__(self, shape: tuple[int, int], positive: float, negative: float) -> None:
         """`positive` and `negative` are the sensor's thresholds C+ and C-, in log brightness."""
         self._thresholds = np.float32(positive), np.float32(negative)
-        self._counts = np.zeros((2, *shape), np.int32)  # negative and positive events
+        self._counts = np.zeros((*shape, 2), np.int32)  # negative and positive events
         self._last = np.zeros(shape, np.int8)  # polarity of the last event
 
     def add(self, events: Events) -> None:
@@ -46,8 +46,8 @@ class BrightnessChange:
         """Return the change since the beginning."""
         positive, negative = self._thresholds
         beyond = np.float32(HYSTERESIS)
-        fell = self._counts[0].astype(np.float32) + beyond * (self._last < 0)
-        rose = self._counts[1].astype(np.float32) + beyond * (self._last > 0)
+        fell = self._counts[..., 0].astype(np.float32) + beyond * (self._last < 0)
+        rose = self._counts[..., 1].astype(np.float32) + beyond * (self._last > 0)
         return positive * rose - negative * fell
 
     def reset(self) -> None:

@@ -292,7 +292,7 @@ class BrightnessTracker:
                 self._path.replace(m.index, m.T_world_camera)
         self._settled = measured
 
-    def _solve(self, iterations: int = 12, is_robust: bool = True) -> None:
+    def _solve(self, iterations: int = 8, is_robust: bool = True) -> None:
         """Solve for the keyframe's image from the last frames, and choose its pixels to align."""
         keyframe = self._keyframe
         assert keyframe is not None

@@ -139,15 +139,21 @@ class KeyframeAligner:
         """Return what was measured up to a frame, at the size of brightness images."""
         for _ in range(self._level):
             change = downscaled(change)
-        depth = None if frame.depth is None else Depth(frame.depth, frame.level(self._level).depth)
+        depth = None if frame.depth is None else self._reduced(frame.depth)
         return Moment(index, frame.timestamp, change, depth)
+
+    def _reduced(self, depth: np.ndarray) -> Depth:  # [H, W] metres
+        small = depth
+        for _ in range(self._level):
+            small = downscaled_depth(small)
+        return Depth(depth, small)
 
     def solve(
         self,
         keyframe: BrightnessKeyframe,
         moments: Sequence[Moment],
         poses: Sequence[np.ndarray],  # [4, 4] T_camera_keyframe at these moments
-        iterations: int = 12,
+        iterations: int = 8,
         is_robust: bool = True,
     ) -> None:
         """Solve for the keyframe's image, average its depth, and choose its pixels to align."""
@@ -168,16 +174,14 @@ class KeyframeAligner:
     ) -> Depth:
         """Return the keyframe's depth averaged with that of other moments where they agree."""
         with_depth = [(m.depth.full, T) for m, T in zip(moments, poses) if m.depth is not None]
-        small = full = average_depth(
+        average = average_depth(
             keyframe.measured.full,
             [depth for depth, _ in with_depth],
             [T for _, T in with_depth],
             self._rays,
             DepthAgreement(self._model.depth_sigma, self._model.depth_sigma_2),
         )
-        for _ in range(self._level):
-            small = downscaled_depth(small)
-        return Depth(full, small)
+        return self._reduced(average)
 
     def with_points(self, keyframe: BrightnessKeyframe) -> BrightnessKeyframe:
         """Return a reduced keyframe with pixels to align."""

@@ -399,8 +399,11 @@ class Alignment:
         points = [direction.points.numpy() for direction in directions]
         rows = points[0].shape[1] if points else POINT_SIZE
         self._is_compositional = rows > POINT_SIZE
-        self._points = torch.empty(sum(map(len, points)), rows, LANES, dtype=float_dtype())
-        np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
+        if len(directions) == 1:
+            self._points = directions[0].points
+        else:
+            self._points = torch.empty(sum(map(len, points)), rows, LANES, dtype=float_dtype())
+            np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
         self._jobs = np.empty((len(directions), JOB_SIZE), _numpy_float())
         self._parts: list[slice] = []
         bounds = []

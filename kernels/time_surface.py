@@ -10,7 +10,7 @@ import taichi as ti
 
 from kernels.runtime import CHUNK, check_shape, workers
 
-MANY_EVENTS = 1_000_000  # below this numpy is done before a second core has woken up
+MANY_EVENTS = 500_000  # below this numpy is done before a second core has woken up
 PACKED = 4  # int16 to a 64-bit word
 EVEN = 0x0000FFFF0000FFFF  # bits of the first and the third
 
@@ -72,14 +72,18 @@ def _count_events(
     x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
     polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N]
-    counts: ti.types.ndarray(ti.i32, ndim=3),  # in and out [2, H, W]
-    last: ti.types.ndarray(ti.i8, ndim=2),  # in and out [H, W]
+    width: ti.i32,
+    counts: ti.types.ndarray(ti.i32, ndim=1),  # in and out [H W 2]
+    last: ti.types.ndarray(ti.i8, ndim=1),  # in and out [H W]
 ):
     ti.loop_config(serialize=True)  # the last event wins
     for i in range(x.shape[0]):
-        sign = ti.select(polarity[i] > 0, 1, 0)
-        counts[sign, y[i], x[i]] = counts[sign, y[i], x[i]] + 1
-        last[y[i], x[i]] = polarity[i]
+        pixel = ti.cast(y[i], ti.i32) * width + ti.cast(x[i], ti.i32)
+        is_positive = (
+            ti.cast(polarity[i], ti.i32) + 1 >> 1
+        )  # as a condition it would often be predicted wrong
+        counts[2 * pixel + is_positive] = counts[2 * pixel + is_positive] + 1
+        last[pixel] = polarity[i]
 
 
 def update_last_timestamps(
@@ -167,22 +171,22 @@ def count_events(
     x: np.ndarray,  # [N] int16
     y: np.ndarray,  # [N] int16
     polarity: np.ndarray,  # [N] int8, -1 or +1, in order of time
-    counts: np.ndarray,  # [2, H, W] int32, changed in place: negative and positive events
+    counts: np.ndarray,  # [H, W, 2] int32, changed in place: negative and positive events
     last: np.ndarray,  # [H, W] int8, changed in place: polarity of the newest event
 ) -> None:
     """Add events to each pixel's numbers of either polarity, and note its newest one."""
     check_shape("y", y, x.shape)
     check_shape("polarity", polarity, x.shape)
-    check_shape("counts", counts, (2, *last.shape))
+    check_shape("counts", counts, (*last.shape, 2))
     if len(x):
         _check_inside(x, y, last.shape)
-        _count_events(x, y, polarity, counts, last)
+        _count_events(x, y, polarity, last.shape[1], counts.reshape(-1), last.reshape(-1))
 
 
 def compile_kernels() -> None:
     """Compile what a running sum needs, so that the first frame of a sequence need not wait for it."""
     place, one = np.zeros(1, np.int16), np.ones(1, np.int8)
-    count_events(place, place, one, np.zeros((2, 1, 1), np.int32), np.zeros((1, 1), np.int8))
+    count_events(place, place, one, np.zeros((1, 1, 2), np.int32), np.zeros((1, 1), np.int8))
 
 
 def _check_inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> None:
