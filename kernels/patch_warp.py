@@ -213,16 +213,13 @@ def _linearise(
                             g_x, g_y, g_z = 0.0 - d_x * du, 0.0 - d_y * dv, 1.0 + d_x * du_z + d_y * dv_z
                             r, scale, is_used = r_depth, 1.0 / depth_sigma, is_smooth
                             share, counted = depth_weight, ti.select(depth_weight > 0, 1.0, 0.0)
-                        additive = [
+                        J = [
                             g_x, g_y, g_z,
                             p_y * g_z - p_z * g_y, p_z * g_x - p_x * g_z, p_x * g_y - p_y * g_x,
                         ]  # fmt: skip
-                        J = [
-                            points[block, POINT_SIZE + 6 * k + a]
-                            if ti.static(is_compositional)
-                            else additive[a]
-                            for a in range(6)
-                        ]
+                        if ti.static(is_compositional):
+                            for a in ti.static(range(6)):
+                                J[a] = points[block, POINT_SIZE + 6 * k + a]
                         weight, cost = huber(r * scale, threshold)
                         total[COST] += ti.select(is_used, share * cost, 0.0)
                         total[NUM_SURFACE + k] += ti.select(is_used, counted, 0.0)
