@@ -365,6 +365,7 @@ def interrupt_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_interrupt_saves_what_there_is_and_exits_130(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    before = signal.getsignal(signal.SIGINT)
     interrupt_at(5, monkeypatch)
     config = config_for(tiny_folder, tmp_path)
     with pytest.raises(SystemExit) as stop:
@@ -379,7 +380,7 @@ def test_interrupt_saves_what_there_is_and_exits_130(
     assert len(read_tum(folder / "trajectory_tum.txt")) == 6
     assert "interrupted" in (folder / "log.txt").read_text()
     assert leftovers(tmp_path) == []
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_interrupt_while_refining_stops_it(
