@@ -172,32 +172,25 @@ class BrightnessTracker:
 
     def _follow(self, moment: Moment, guess: np.ndarray) -> tuple[TrackingResult, float]:
         """Return the frame's pose and the share of the keyframe in view."""
-        keyframe = self._keyframe
-        assert keyframe is not None
 
         def attempt(start: np.ndarray) -> tuple[TrackingResult, float]:
-            aligned = self._align(keyframe, keyframe.image_at(moment), moment.depth, start)
-            return self._judged(keyframe, aligned, guess), aligned.overlap
+            aligned = self._align(moment, moment.depth, start)
+            return self._judged(aligned, guess), aligned.overlap
 
         return best_attempt(attempt, guess, self._path.pose(-1))
 
-    def _align(
-        self,
-        keyframe: BrightnessKeyframe,
-        image: np.ndarray,  # [h, w] log brightness
-        depth: Depth | None,
-        start: np.ndarray,  # [4, 4] T_world_camera
-    ) -> Aligned:
+    def _align(self, moment: Moment, depth: Depth | None, start: np.ndarray) -> Aligned:
+        """Align a moment to the keyframe, with this depth; `start` is a T_world_camera."""
+        keyframe = self._keyframe
+        assert keyframe is not None
         T_keyframe_world = rigid_inverse(self._path.pose(keyframe.index))
-        return self._aligner.align(keyframe, image, depth, T_keyframe_world @ start)
+        return self._aligner.align(keyframe, keyframe.image_at(moment), depth, T_keyframe_world @ start)
 
-    def _in_world(self, keyframe: BrightnessKeyframe, aligned: Aligned) -> np.ndarray:  # [4, 4]
-        return self._path.pose(keyframe.index) @ aligned.T_keyframe_camera
-
-    def _judged(self, keyframe: BrightnessKeyframe, aligned: Aligned, guess: np.ndarray) -> TrackingResult:
+    def _judged(self, aligned: Aligned, guess: np.ndarray) -> TrackingResult:
         """Return the pose, or the guess and a reason where it cannot be trusted."""
+        assert self._keyframe is not None
         problem = aligned.problem(self._config.min_inliers)
-        T = guess if problem else self._in_world(keyframe, aligned)
+        T = guess if problem else self._path.pose(self._keyframe.index) @ aligned.T_keyframe_camera
         return TrackingResult(T, not problem, aligned.quality, problem)
 
     def _keep_up(self, moment: Moment, is_good: bool, overlap: float) -> str:
@@ -261,10 +254,10 @@ class BrightnessTracker:
         """Return the pose by brightness alone and how well it is determined, or None."""
         keyframe, T = self._keyframe, self._path.pose(moment.index)
         assert keyframe is not None
-        aligned = self._align(keyframe, keyframe.image_at(moment), None, T)
+        aligned = self._align(moment, None, T)
         if moment.index == keyframe.index:
             return T, aligned.system
-        result = self._judged(keyframe, aligned, T)
+        result = self._judged(aligned, T)
         return (result.T_world_camera, aligned.system) if result.converged else None
 
     def _learn_motion(self, errors: list[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -314,8 +307,8 @@ class BrightnessTracker:
             if moment.index in (0, keyframe.index):
                 continue
             start = self._path.pose(moment.index)
-            aligned = self._align(keyframe, keyframe.image_at(moment), moment.depth, start)
-            result = self._judged(keyframe, aligned, start)
+            aligned = self._align(moment, moment.depth, start)
+            result = self._judged(aligned, start)
             if result.converged:
                 self._path.replace(moment.index, result.T_world_camera)
 

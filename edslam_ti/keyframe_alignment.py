@@ -17,7 +17,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame, downscaled, downscaled_depth
 from edslam_ti.geometry import exp_matrix, orthonormalized, rigid_inverse
-from edslam_ti.tracking import MAX_CONDITION, MIN_PIXELS, levenberg_marquardt
+from edslam_ti.tracking import MAX_CONDITION, MIN_PIXELS, levenberg_marquardt, residual_model
 from kernels import depth_average
 from kernels.depth_average import DepthAgreement, PixelRays, average_depth
 from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, ResidualModel
@@ -115,14 +115,7 @@ class KeyframeAligner:
         self._cameras = [camera.downscaled(2 ** (self._level + k)) for k in range(2)]
         self._random = np.random.default_rng(seed + 1)
         self._num_pixels = config.num_patches * config.patch_size**2 // 4
-        self._model = ResidualModel(
-            max_depth_difference=config.max_depth_difference,
-            surface_sigma=config.brightness_sigma,
-            depth_weight=config.depth_weight,
-            depth_sigma=config.depth_sigma,
-            depth_sigma_2=config.depth_sigma_2,
-            huber_threshold=config.huber_threshold,
-        )
+        self._model = residual_model(config, config.brightness_sigma)
         self._brightness_only = replace(self._model, depth_weight=0.0)
         self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
         compile_kernels()
@@ -153,8 +146,8 @@ class KeyframeAligner:
         keyframe: BrightnessKeyframe,
         moments: Sequence[Moment],
         poses: Sequence[np.ndarray],  # [4, 4] T_camera_keyframe at these moments
-        iterations: int = 8,
-        is_robust: bool = True,
+        iterations: int,
+        is_robust: bool,
     ) -> None:
         """Solve for the keyframe's image, average its depth, and choose its pixels to align."""
         keyframe.depth = self._averaged_depth(keyframe, moments, poses)

@@ -106,14 +106,7 @@ class BidirectionalPatchTracker:
         self._random = np.random.default_rng(seed)
         self._keyframe: _Reference | None = None
         self._previous: _Reference | None = None
-        self._model = ResidualModel(
-            max_depth_difference=config.max_depth_difference,
-            surface_sigma=config.surface_sigma,
-            depth_weight=config.depth_weight,
-            depth_sigma=config.depth_sigma,
-            depth_sigma_2=config.depth_sigma_2,
-            huber_threshold=config.huber_threshold,
-        )
+        self._model = residual_model(config, config.surface_sigma)
         self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
         compile_kernels()
 
@@ -227,6 +220,18 @@ class BidirectionalPatchTracker:
             template = (level.surface, level.depth) if config.form == "compositional" else None
             points.append(patches.points(level.camera.intrinsics, template))
         return _Reference(frame, points, has_surface)
+
+
+def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualModel:
+    """Return how residuals are weighted, given the standard deviation of those of what is aligned."""
+    return ResidualModel(
+        max_depth_difference=config.max_depth_difference,
+        surface_sigma=surface_sigma,
+        depth_weight=config.depth_weight,
+        depth_sigma=config.depth_sigma,
+        depth_sigma_2=config.depth_sigma_2,
+        huber_threshold=config.huber_threshold,
+    )
 
 
 def best_attempt(

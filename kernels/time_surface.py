@@ -79,9 +79,8 @@ def _count_events(
     ti.loop_config(serialize=True)  # the last event wins
     for i in range(x.shape[0]):
         pixel = ti.cast(y[i], ti.i32) * width + ti.cast(x[i], ti.i32)
-        is_positive = (
-            ti.cast(polarity[i], ti.i32) + 1 >> 1
-        )  # as a condition it would often be predicted wrong
+        # As a condition, the polarity would often be predicted wrong.
+        is_positive = ti.cast(polarity[i], ti.i32) + 1 >> 1
         counts[2 * pixel + is_positive] = counts[2 * pixel + is_positive] + 1
         last[pixel] = polarity[i]
 
