@@ -273,10 +273,32 @@ def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str 
 def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
     """Take in a batch of events; evaluate the surface."""
     rng = np.random.default_rng(0)
-    x = rng.integers(0, size[0], count).astype(np.int16)
-    y = rng.integers(0, size[1], count).astype(np.int16)
     t = np.sort(rng.uniform(0, 1, count))
     last = np.full((size[1], size[0]), -np.inf)
+    everywhere = [rng.integers(0, n, count).astype(np.int16) for n in size]
+    task = f"{size[0]}x{size[1]}, {count} events"
+    yield from _update(f"{task}: update", *everywhere, t, last, watch)
+    # Most of them in the middle, none at all in the corners
+    middle = [np.clip(rng.normal(n / 2, n / 6, count), 0, n - 1).astype(np.int16) for n in size]
+    yield from _update(f"{task}, most in the middle: update", *middle, t, last, watch)
+    evaluations = {
+        OURS: lambda: time_surface(last, 1.0, 0.03),
+        "torch twin": lambda: reference.time_surface(torch.from_numpy(last), 1.0, 0.03),
+    }
+    work = Work(last.nbytes + last.nbytes // 2, 20 * last.size)
+    yield from watch.compare("time_surface", f"{task}: evaluate", evaluations, work)
+
+
+def _update(
+    task: str,
+    x: np.ndarray,  # [N] int16
+    y: np.ndarray,  # [N] int16
+    t: np.ndarray,  # [N] float64 seconds
+    last: np.ndarray,  # [H, W] float64 seconds
+    watch: Stopwatch,
+) -> Iterator[Row]:
+    """Take in a batch of events."""
+    size = last.shape[::-1]
 
     def assign() -> None:
         last[y, x] = t
@@ -289,18 +311,11 @@ def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row
     if importlib.util.find_spec("numba"):
         compiled = _numba_assignment()
         updates["numba"] = lambda: compiled(x, y, t, last)
-    if watch.has_alternatives and importlib.util.find_spec("dv_processing") and count <= DV_LIMIT:
+    if watch.has_alternatives and importlib.util.find_spec("dv_processing") and len(t) <= DV_LIMIT:
         updates["dv-processing"] = _dv_update(x, y, t, size)
-    task = f"{size[0]}x{size[1]}, {count} events"
-    event_bytes = sum(array.itemsize for array in (x, y, t))
-    work = Work(event_bytes * count + last.itemsize * min(count, last.size))
-    yield from watch.compare("time_surface", f"{task}: update", updates, work)
-    evaluations = {
-        OURS: lambda: time_surface(last, 1.0, 0.03),
-        "torch twin": lambda: reference.time_surface(torch.from_numpy(last), 1.0, 0.03),
-    }
-    work = Work(last.nbytes + last.nbytes // 2, 20 * last.size)
-    yield from watch.compare("time_surface", f"{task}: evaluate", evaluations, work)
+    newest = min(len(t), last.size)  # times that are needed
+    work = Work(x.nbytes + y.nbytes + (t.itemsize + last.itemsize) * newest)
+    yield from watch.compare("time_surface", task, updates, work)
 
 
 def _numba_assignment() -> Callable[..., None]:

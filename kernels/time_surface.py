@@ -11,6 +11,8 @@ import taichi as ti
 from kernels.runtime import CHUNK, check_shape, workers
 
 MANY_EVENTS = 500_000  # below this numpy is done before a second core has woken up
+ROUNDS = 4  # at most, newest events first, until every pixel has had one
+ROUND = 8  # events a pixel, after which that may be
 PACKED = 4  # int16 to a 64-bit word
 EVEN = 0x0000FFFF0000FFFF  # bits of the first and the third
 
@@ -20,6 +22,8 @@ def _newest_events(
     x: ti.types.ndarray(ti.i64, ndim=1),  # [N / 4] four int16 each, none negative
     y: ti.types.ndarray(ti.i64, ndim=1),  # [N / 4]
     polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N], any if not by polarity
+    first: ti.i32,  # word
+    last: ti.i32,  # word after those to look at
     height: ti.i32,
     width: ti.i32,
     num_workers: ti.i32,
@@ -28,14 +32,13 @@ def _newest_events(
 ):
     # Parallel stores to one image race and atomics are slow: each worker has a part of the time and an
     # image of its own, of indices, because those are half as long as times and need not be read.
-    num_pixels, words = newest.shape[0] // num_workers, ti.cast(x.shape[0], ti.i64)
+    num_pixels, words = newest.shape[0] // num_workers, ti.cast(last - first, ti.i64)
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
             w = chunk // CHUNK
             own = w * num_pixels
-            for word in range(
-                ti.cast(words * w // num_workers, ti.i32), ti.cast(words * (w + 1) // num_workers, ti.i32)
-            ):
+            begin, end = words * w // num_workers, words * (w + 1) // num_workers
+            for word in range(first + ti.cast(begin, ti.i32), first + ti.cast(end, ti.i32)):
                 # Two pixels, y * width + x, in one product: either half of a number is one of them.
                 even = (y[word] & ti.i64(EVEN)) * width + (x[word] & ti.i64(EVEN))
                 odd = (y[word] >> 16 & ti.i64(EVEN)) * width + (x[word] >> 16 & ti.i64(EVEN))
@@ -117,13 +120,10 @@ def update_last_timestamps(
             pixels += (polarity > 0) * (height * width)
         flat[pixels] = t  # of several events at a pixel numpy keeps the last
         return
-    newest = _memory(workers() * flat.size)
-    newest.fill(-1)
     words = len(x) // PACKED
     packed = [np.ascontiguousarray(array[: words * PACKED]).view(np.int64) for array in (x, y)]
     signs = np.empty(0, np.int8) if polarity is None else polarity
-    _newest_events(*packed, signs, height, width, workers(), newest, polarity is not None)
-    event = newest.reshape(workers(), -1).max(0)
+    event = _newest(packed, signs, (height, width), flat.size)
     np.copyto(flat, t.take(event, mode="clip"), where=event >= 0)
     if rest := len(x) % PACKED:
         update_last_timestamps(
@@ -131,10 +131,33 @@ def update_last_timestamps(
         )
 
 
+def _newest(
+    packed: list[np.ndarray],  # x and y, [N / 4] int64
+    polarity: np.ndarray,  # [N] int8, or [0] if polarities do not matter
+    shape: tuple[int, int],  # (H, W)
+    num_pixels: int,  # H W, twice that by polarity
+) -> np.ndarray:  # [pixels] int32
+    """Return the index of each pixel's newest event, -1 where there was none."""
+    newest, event = _memory(workers(), num_pixels)
+    event.fill(-1)
+    words = len(packed[0])
+    rounds = min(max(words * PACKED // (ROUND * num_pixels), 1), ROUNDS)
+    for k in reversed(range(rounds)):
+        newest.fill(-1)
+        part = words * k // rounds, words * (k + 1) // rounds
+        flat = newest.reshape(-1)
+        _newest_events(*packed, polarity, *part, *shape, workers(), flat, len(polarity) > 0)
+        for indices in newest:  # a later event has a larger index
+            np.maximum(event, indices, out=event)
+        if event.min() >= 0:
+            break
+    return event
+
+
 @functools.lru_cache(maxsize=1)
-def _memory(size: int) -> np.ndarray:
+def _memory(num_workers: int, num_pixels: int) -> tuple[np.ndarray, np.ndarray]:
     """Return memory that is kept: the pages of a fresh array cost more than to fill it."""
-    return np.empty(size, np.int32)
+    return np.empty((num_workers, num_pixels), np.int32), np.empty(num_pixels, np.int32)
 
 
 def time_surface(

@@ -80,6 +80,21 @@ def test_large_batches_match_the_twin_and_events_outside_change_nothing() -> Non
     assert np.array_equal(last, before)
 
 
+@pytest.mark.parametrize("silent", ["no pixel", "one pixel", "one pixel, late"])
+def test_large_batches_match_the_twin_wherever_the_newest_event_lies(silent: str) -> None:
+    x, y, t, _ = make_events(MANY_EVENTS + 1, 7)
+    at_pixel = (x == 5) & (y == 3)
+    if silent == "one pixel":
+        x[at_pixel] = 6
+    elif silent == "one pixel, late":  # its newest event is among the oldest
+        x[at_pixel & (np.arange(len(x)) > 2000)] = 6
+    last = np.full(SHAPE, -np.inf)
+    update_last_timestamps(x, y, t, last)
+    expected = reference.last_timestamps(*(torch.from_numpy(a) for a in (x, y, t)), SHAPE)
+    assert np.array_equal(last, expected.numpy())
+    assert np.isinf(last[3, 5]) == (silent == "one pixel")
+
+
 @pytest.mark.parametrize("n", [500, MANY_EVENTS + 3])
 def test_polarities_have_surfaces_of_their_own(n: int) -> None:
     x, y, t, polarity = make_events(n, 4)
