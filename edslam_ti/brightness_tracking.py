@@ -9,7 +9,7 @@ import numpy as np
 
 from edslam_ti.brightness_image import BrightnessChange
 from edslam_ti.camera import Camera
-from edslam_ti.config import TrackingConfig
+from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
 from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import exp_matrix, is_near, log_vector, rigid_inverse
@@ -49,11 +49,16 @@ class BrightnessTracker:
     """
 
     def __init__(
-        self, camera: Camera, contrast: ContrastThreshold, config: TrackingConfig, seed: int
+        self,
+        camera: Camera,
+        contrast: ContrastThreshold,
+        surface_config: TimeSurfaceConfig,
+        config: TrackingConfig,
+        seed: int,
     ) -> None:
         self._config = config
         self._aligner = KeyframeAligner(camera, config, seed)
-        self._surface_tracker = BidirectionalPatchTracker(config, seed)
+        self._surface_tracker = BidirectionalPatchTracker(camera, surface_config, config, seed)
         self._change = BrightnessChange(camera.shape, *(contrast.value * c for c in contrast.relative))
         self._stretch_start = 0  # first frame of the stretch of uninterrupted events
         self._moments: list[Moment] = []  # the last frames of the stretch

@@ -91,7 +91,7 @@ def make_slam(
         tracker = TruePoses(sequence.true_pose)
     truth = sequence.true_pose(float(samples.timestamps[0]))
     return Slam(
-        FrameBuilder(sequence.camera, config.time_surface),
+        FrameBuilder(sequence.camera),
         tracker,
         mapper if config.mapping.enabled else None,
         initial_pose=np.eye(4) if truth is None else truth,
@@ -166,7 +166,7 @@ def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", c
             if k % ATE_EVERY == 0 and state.sequence.truth is not None:
                 error = ate_rmse_cm(slam.trajectory, state.sequence.truth)
                 ate = "" if error is None else f"  ATE {error:.2f} cm"
-            hertz = len(slam.results) / (slam.frame_seconds + slam.tracking_seconds + slam.mapping_seconds)
+            hertz = len(slam.results) / (slam.tracking_seconds + slam.mapping_seconds)
             status = f"{hertz:.1f} Hz"
             if mapper is not None:
                 status += f"  {mapper.num_gaussians} Gaussians  loss {mapper.loss:.3f}"

@@ -163,7 +163,6 @@ def _stage_seconds(state: Run, saving: float) -> dict[str, float]:
     """Return the seconds that each stage took, divided by the number of frames."""
     slam = state.slam
     stages = {
-        "frame_building": slam.frame_seconds,
         "tracking": slam.tracking_seconds,
         "mapping": slam.mapping_seconds,
         "refinement": state.finish_seconds,
@@ -203,8 +202,8 @@ def _metrics(state: Run, of_map: dict[str, Any]) -> dict[str, Any]:
         "contrast_threshold_positive": _rounded(state.contrast.positive),
         "contrast_threshold_negative": _rounded(state.contrast.negative),
         "contrast_threshold_deviation": _rounded(state.contrast.deviation),
-        "tracking_hz": _rounded(frames / (slam.frame_seconds + slam.tracking_seconds)),
-        "tracking_s": _rounded(slam.frame_seconds + slam.tracking_seconds),
+        "tracking_hz": _rounded(frames / slam.tracking_seconds),
+        "tracking_s": _rounded(slam.tracking_seconds),
         "mapping_s": _rounded(slam.mapping_seconds),
         "refinement_s": _rounded(state.finish_seconds),
         "device": f"{config.device} ({platform.machine()}, {config.threads} threads)",

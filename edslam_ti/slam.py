@@ -24,7 +24,6 @@ class Slam:
     def __post_init__(self) -> None:
         self.trajectory = Trajectory()
         self.results: list[TrackingResult] = []
-        self.frame_seconds = 0.0
         self.tracking_seconds = 0.0
         self.mapping_seconds = 0.0
 
@@ -35,17 +34,15 @@ class Slam:
 
     def process(self, sample: Sample, is_held_out: bool = False) -> TrackingResult:
         """Track one sample and map it; a held-out one is tracked, but its depth is not mapped."""
+        frame = self.frame_builder.build(sample, is_held_out)
         started = time.perf_counter()
-        frame = self.frame_builder.build(sample, is_held_out)  # Eq. 1
-        built = time.perf_counter()
         guess = self.trajectory.at(frame.timestamp) if len(self.trajectory) else self.initial_pose
-        result = self.tracker.track(frame, guess, self.trajectory)  # Eq. 2-5
+        result = self.tracker.track(frame, guess, self.trajectory)  # Eq. 1-5
         self.trajectory.append(frame.timestamp, result.T_world_camera)
         self.results.append(result)
         tracked = time.perf_counter()
         if self.mapper is not None:
             self.mapper.update(frame, self.trajectory)  # Eq. 6-16
-        self.frame_seconds += built - started
-        self.tracking_seconds += tracked - built
+        self.tracking_seconds += tracked - started
         self.mapping_seconds += time.perf_counter() - tracked
         return result

@@ -7,9 +7,11 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from edslam_ti.config import TrackingConfig
+from edslam_ti.camera import Camera
+from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import exp_matrix, orthonormalized, rigid_inverse
+from edslam_ti.surface_frame import SurfaceFrame, SurfaceFrameBuilder
 from edslam_ti.trajectory import Trajectory
 from kernels.patch_warp import (
     Alignment,
@@ -61,7 +63,7 @@ class TruePoses:
 class _Reference:
     """A frame to align to, with its patches at every pyramid level."""
 
-    frame: Frame
+    view: SurfaceFrame
     points: list[Tensor]  # [blocks, 4 or 16, LANES] each, from `Patches.points`
     has_surface: bool  # False: too few events yet, only its depth can be aligned
 
@@ -101,8 +103,11 @@ class _Problem:
 class BidirectionalPatchTracker:
     """Aligns each frame to its references by Levenberg-Marquardt on SE(3), coarse to fine."""
 
-    def __init__(self, config: TrackingConfig, seed: int) -> None:
+    def __init__(
+        self, camera: Camera, surface_config: TimeSurfaceConfig, config: TrackingConfig, seed: int
+    ) -> None:
         self._config = config
+        self._surfaces = SurfaceFrameBuilder(camera, surface_config)
         self._random = np.random.default_rng(seed)
         self._keyframe: _Reference | None = None
         self._previous: _Reference | None = None
@@ -130,7 +135,8 @@ class BidirectionalPatchTracker:
         return result
 
     def refer_to(self, frame: Frame) -> None:
-        """Align the next frames to this one, whose pose is on the trajectory."""
+        """Align the next frames to this one, whose pose is on the trajectory, and forget earlier ones."""
+        self._surfaces.reset()
         self._keyframe = self._previous = self._with_patches(frame)
 
     def _track(
@@ -162,7 +168,7 @@ class BidirectionalPatchTracker:
 
     def _align(self, current: _Reference, guess: np.ndarray, trajectory: Trajectory) -> _Alignment:
         T = guess
-        references = [(r, trajectory.at(r.frame.timestamp)) for r in self._references()]
+        references = [(r, trajectory.at(r.view.frame.timestamp)) for r in self._references()]
         for level in reversed(range(self._config.levels)):
             problem = self._problem(current, references, level)
             T, system = levenberg_marquardt(problem.linearise, T, self._config.iterations)
@@ -184,15 +190,15 @@ class BidirectionalPatchTracker:
 
         The new frame's patches can be warped only where it has depth.
         """
-        is_bidirectional = self._config.directions == "both" and current.frame.depth is not None
-        now = current.frame.level(level)
+        is_bidirectional = self._config.directions == "both" and current.view.frame.depth is not None
+        now = current.view.level(level)
         directions: list[Direction] = []
         for view, (reference, _) in enumerate(references, start=1):
             model = self._model if reference.has_surface and current.has_surface else self._depth_only
             directions.append(Direction(reference.points[level], 0, model))
             if is_bidirectional:
                 directions.append(Direction(current.points[level], view, model))
-        views = [now, *(reference.frame.level(level) for reference, _ in references)]
+        views = [now, *(reference.view.level(level) for reference, _ in references)]
         alignment = Alignment(
             directions, np.stack([view.surface_and_depth for view in views]), now.camera.intrinsics
         )
@@ -203,8 +209,8 @@ class BidirectionalPatchTracker:
 
         Before the first events there is no surface: then they are drawn where there is depth.
         """
-        config = self._config
-        finest = frame.level(0)
+        config, view = self._config, self._surfaces.build(frame)
+        finest = view.level(0)
         has_depth = finest.depth > 0
         on_surface = has_depth & (finest.surface > config.min_time_surface)
         has_surface = int((finest.surface > config.min_time_surface).sum()) >= MIN_PIXELS
@@ -213,13 +219,13 @@ class BidirectionalPatchTracker:
         centres = np.stack([columns[chosen], rows[chosen]], -1)
         points = []
         for k in range(config.levels):
-            level = frame.level(k)
+            level = view.level(k)
             size = config.patch_size if k == 0 else max(3, config.patch_size // 2 | 1)
             at_level = _distinct(centres >> k) if k else centres
             patches = extract_patches(level.surface, level.depth, at_level.astype(np.int32), size)
             template = (level.surface, level.depth) if config.form == "compositional" else None
             points.append(patches.points(level.camera.intrinsics, template))
-        return _Reference(frame, points, has_surface)
+        return _Reference(view, points, has_surface)
 
 
 def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualModel:

@@ -68,7 +68,7 @@ def make_slam(sequence: EventDepthSequence, samples: list[Sample], config: Confi
         sequence, ContrastThreshold(sequence.contrast_threshold, "data"), config
     )
     return Slam(
-        FrameBuilder(sequence.camera, config.time_surface),
+        FrameBuilder(sequence.camera),
         TruePoses(sequence.true_pose) if config.poses == "truth" else tracker,
         mapper if config.mapping.enabled else None,
         initial_pose=samples[0].T_world_camera,

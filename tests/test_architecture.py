@@ -27,6 +27,7 @@ RANKS: list[list[str]] = [
         *(
             "edslam_ti.contrast",
             "edslam_ti.frame",
+            "edslam_ti.surface_frame",
             "edslam_ti.tracking",
             "edslam_ti.keyframes",
             "edslam_ti.event_images",
@@ -71,7 +72,7 @@ LIBRARIES: dict[str, list[str]] = {
         *("edslam_ti.pointcloud", "edslam_ti.pictures"),
     ],
     "cv2": [
-        *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.frame", "edslam_ti.pictures"),
+        *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.surface_frame", "edslam_ti.pictures"),
         *("edslam_ti.brightness", "edslam_ti.contrast", "edslam_ti.event_images"),
         *("edslam_ti.keyframe_alignment", "edslam_ti.place_recognition", "edslam_ti.pointcloud"),
     ],

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sequences import record_tiny_room
 
-from edslam_ti.config import MappingConfig, TimeSurfaceConfig
+from edslam_ti.config import MappingConfig
 from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
@@ -30,7 +30,7 @@ def images_of(
         assert sequence.contrast_threshold is not None
         contrast = ContrastThreshold(sequence.contrast_threshold, "data")
     images = EventImages(sequence.camera, contrast, MappingConfig(**settings))
-    builder, trajectory = FrameBuilder(sequence.camera, TimeSurfaceConfig()), Trajectory()
+    builder, trajectory = FrameBuilder(sequence.camera), Trajectory()
     for k, sample in enumerate(samples):
         assert sample.T_world_camera is not None
         trajectory.append(sample.timestamp, sample.T_world_camera)

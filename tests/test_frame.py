@@ -1,4 +1,4 @@
-"""Samples become frames: time surface with memory, and a pyramid that mixes no surfaces."""
+"""Samples become frames; surfaces have a memory, and a pyramid mixes no surfaces of depth."""
 
 import numpy as np
 
@@ -7,6 +7,7 @@ from edslam_ti.config import TimeSurfaceConfig
 from edslam_ti.datasets import Sample
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame, FrameBuilder
+from edslam_ti.surface_frame import SurfaceFrame, SurfaceFrameBuilder
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
 SHARP = TimeSurfaceConfig(decay=0.1, blur=0)
@@ -16,22 +17,23 @@ def one_event(x: int, y: int, t: float) -> Events:
     return Events(np.array([x], np.int16), np.array([y], np.int16), np.array([t]), np.array([1], np.int8))
 
 
-def frame(surface: np.ndarray | None = None, depth: np.ndarray | None = None) -> Frame:
-    zeros = np.zeros(CAMERA.shape, np.float32)
-    return Frame(0.1, 0.0, Events.empty(), CAMERA, zeros if surface is None else surface, depth, None)
+def frame(timestamp: float, events: Events, depth: np.ndarray | None = None) -> Frame:
+    return Frame(timestamp, 0.0, events, CAMERA, depth, None)
 
 
-def test_surface_remembers_events_of_earlier_samples() -> None:
-    builder = FrameBuilder(CAMERA, SHARP)
-    builder.build(Sample(0.05, one_event(2, 1, 0.04), depth=None))
-    later = builder.build(Sample(0.15, one_event(5, 3, 0.12), depth=None))
-    np.testing.assert_allclose(later.surface[1, 2], np.exp(-1.1), rtol=1e-5)
-    np.testing.assert_allclose(later.surface[3, 5], np.exp(-0.3), rtol=1e-5)
-    assert np.count_nonzero(later.surface) == 2
+def test_surface_remembers_events_of_earlier_frames_until_it_is_reset() -> None:
+    builder = SurfaceFrameBuilder(CAMERA, SHARP)
+    builder.build(frame(0.05, one_event(2, 1, 0.04)))
+    later = builder.build(frame(0.15, one_event(5, 3, 0.12))).level(0).surface
+    np.testing.assert_allclose(later[1, 2], np.exp(-1.1), rtol=1e-5)
+    np.testing.assert_allclose(later[3, 5], np.exp(-0.3), rtol=1e-5)
+    assert np.count_nonzero(later) == 2
+    builder.reset()
+    assert not builder.build(frame(0.2, Events.empty())).level(0).surface.any()
 
 
 def test_chunk_begins_where_the_last_one_ended() -> None:
-    builder = FrameBuilder(CAMERA, SHARP)
+    builder = FrameBuilder(CAMERA)
     first = builder.build(Sample(0.05, Events.empty(), depth=None))
     second = builder.build(Sample(0.15, Events.empty(), depth=None), is_held_out=True)
     assert (first.previous_timestamp, second.previous_timestamp) == (0.05, 0.05)
@@ -39,16 +41,15 @@ def test_chunk_begins_where_the_last_one_ended() -> None:
 
 
 def test_blur_spreads_an_event_and_keeps_its_sum() -> None:
-    blurred = FrameBuilder(CAMERA, TimeSurfaceConfig(decay=0.1, blur=0.6)).build(
-        Sample(0.05, one_event(4, 3, 0.05 - 1e-9), depth=None)
-    )
-    assert 0 < blurred.surface[3, 5] < blurred.surface[3, 4] < 1
-    np.testing.assert_allclose(blurred.surface.sum(), 1.0, rtol=0.01)  # borders reflect a little of it
+    builder = SurfaceFrameBuilder(CAMERA, TimeSurfaceConfig(decay=0.1, blur=0.6))
+    blurred = builder.build(frame(0.05, one_event(4, 3, 0.05 - 1e-9))).level(0).surface
+    assert 0 < blurred[3, 5] < blurred[3, 4] < 1
+    np.testing.assert_allclose(blurred.sum(), 1.0, rtol=0.01)  # borders reflect a little of it
 
 
 def test_pyramid_halves_the_image_and_its_camera() -> None:
     surface = np.random.default_rng(0).random(CAMERA.shape, np.float32)
-    level = frame(surface).level(1)
+    level = SurfaceFrame(frame(0.1, Events.empty()), surface).level(1)
     assert (level.camera.width, level.camera.height, level.camera.fx) == (4, 3, 5.0)
     np.testing.assert_allclose(level.surface[1, 2], surface[2:4, 4:6].mean(), rtol=1e-6)
     assert (level.depth == 0).all()  # no depth image: missing everywhere
@@ -59,6 +60,7 @@ def test_pyramid_leaves_out_depth_across_an_edge_or_a_hole() -> None:
     depth[0, 0] = 0  # a hole
     depth[2, 2] = 2.2  # 10 % farther: an edge
     depth[4, 4] = 2.04  # 2 %: the same surface
-    reduced = frame(depth=depth).level(1).depth
+    surface = np.zeros(CAMERA.shape, np.float32)
+    reduced = SurfaceFrame(frame(0.1, Events.empty(), depth), surface).level(1).depth
     assert (reduced[0, 0], reduced[1, 1]) == (0, 0)
     np.testing.assert_allclose([reduced[2, 2], reduced[0, 1]], [2.01, 2.0], rtol=1e-6)

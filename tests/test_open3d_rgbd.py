@@ -49,8 +49,7 @@ def frame(
     timestamp: float, depth: np.ndarray | None, image: np.ndarray | None, held_out: bool = False
 ) -> Frame:
     camera = CAMERA if depth is None else Camera(depth.shape[1], depth.shape[0], 1.0, 1.0, 0.0, 0.0)
-    surface = np.zeros(camera.shape, np.float32)
-    return Frame(timestamp, timestamp - 0.05, Events.empty(), camera, surface, depth, image, held_out)
+    return Frame(timestamp, timestamp - 0.05, Events.empty(), camera, depth, image, held_out)
 
 
 def corner_view(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

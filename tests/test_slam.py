@@ -4,7 +4,6 @@ import numpy as np
 from sequences import make_slam, settings
 
 from edslam_ti.camera import Camera
-from edslam_ti.config import TimeSurfaceConfig
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame, FrameBuilder
@@ -34,7 +33,7 @@ def run(mapper: object = None) -> tuple[Slam, Follower]:
     start = np.eye(4)
     start[2, 3] = 5.0
     tracker = Follower()
-    slam = Slam(FrameBuilder(CAMERA, TimeSurfaceConfig()), tracker, mapper, start)  # type: ignore[arg-type]
+    slam = Slam(FrameBuilder(CAMERA), tracker, mapper, start)  # type: ignore[arg-type]
     for k in range(4):
         slam.process(Sample(0.1 * k, Events.empty(), depth=None), is_held_out=k == 2)
     return slam, tracker

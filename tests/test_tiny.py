@@ -16,6 +16,7 @@ from edslam_ti.frame import FrameBuilder
 from edslam_ti.losses import brightness_change, event_loss
 from edslam_ti.mapping import GaussianMapper
 from edslam_ti.rendering import render
+from edslam_ti.surface_frame import SurfaceFrameBuilder
 from edslam_ti.trajectory import Trajectory, read_tum, write_tum
 from kernels.time_surface import accumulate_polarity
 
@@ -37,12 +38,14 @@ def test_time_surface_is_bright_where_events_are_fresh(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     sample = tiny_samples[0]
-    frame = FrameBuilder(tiny_sequence.camera, TimeSurfaceConfig(decay=0.03, blur=0)).build(sample)
+    camera = tiny_sequence.camera
+    builder = SurfaceFrameBuilder(camera, TimeSurfaceConfig(decay=0.03, blur=0))
+    surface = builder.build(FrameBuilder(camera).build(sample)).level(0).surface
     x, y, t = sample.events.x[-1], sample.events.y[-1], sample.events.t[-1]
-    np.testing.assert_allclose(frame.surface[y, x], np.exp((t - sample.timestamp) / 0.03), rtol=1e-5)  # Eq. 1
-    never = np.ones(frame.surface.shape, bool)
+    np.testing.assert_allclose(surface[y, x], np.exp((t - sample.timestamp) / 0.03), rtol=1e-5)  # Eq. 1
+    never = np.ones(surface.shape, bool)
     never[sample.events.y, sample.events.x] = False
-    assert (frame.surface[never] == 0).all()
+    assert (surface[never] == 0).all()
 
 
 def test_a_motion_of_one_centimetre_is_recovered(

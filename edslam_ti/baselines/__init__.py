@@ -31,10 +31,11 @@ def _ed_slam(
     from edslam_ti.tracking import BidirectionalPatchTracker
 
     tracker: Tracker
-    if config.tracking.brightness:
-        tracker = BrightnessTracker(sequence.camera, contrast, config.tracking, config.seed)
+    surfaces, tracking = config.time_surface, config.tracking
+    if tracking.brightness:
+        tracker = BrightnessTracker(sequence.camera, contrast, surfaces, tracking, config.seed)
     else:
-        tracker = BidirectionalPatchTracker(config.tracking, config.seed)
+        tracker = BidirectionalPatchTracker(sequence.camera, surfaces, tracking, config.seed)
     return tracker, GaussianMapper(sequence.camera, contrast, config)
 
 

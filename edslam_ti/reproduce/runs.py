@@ -80,7 +80,7 @@ def run_case(
         "num_frames": len(slam.results),
         "num_lost_frames": sum(lost.values()),
         "lost": lost,
-        "tracking_hz": round(len(slam.results) / (slam.frame_seconds + slam.tracking_seconds), 2),
+        "tracking_hz": round(len(slam.results) / slam.tracking_seconds, 2),
         "settings": config.model_dump(mode="json"),
     }
 
