@@ -114,6 +114,12 @@ class MappingConfig(Stage):
     """At most so many frames of a stretch are compared when its start image is solved."""
     max_views: int = Field(150, ge=10)
     """At most so many frames are kept to optimise the map for; older ones are thinned out."""
+    frames: bool = False
+    """Use the sequence's grey images, too, freed of motion blur by the events of their exposure; they also
+    tell the level of brightness. Held-out frames' images stay unused."""
+    exposure: float | None = Field(None, ge=0, lt=1)
+    """Seconds over which such an image integrates, centred on its time; omitted: the data set's own
+    (camera.json), else 0: images are sharp."""
     event_weight: float = Field(1.0, ge=0)
     """lambda_event of Eq. 16 (paper: 0.7)."""
     depth_weight: float = Field(0.75, ge=0)

@@ -1,4 +1,7 @@
-"""Images from events: the start image of a stretch of a few seconds, and what has changed since (Eq. 11)."""
+"""Images from events: the start image of a stretch of a few seconds, and what has changed since (Eq. 11).
+
+Where grey images are taken in, too, what has changed counts from the nearest of them.
+"""
 
 from dataclasses import dataclass
 
@@ -13,6 +16,7 @@ from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 from edslam_ti.keyframes import EventArchive
 from edslam_ti.pointcloud import with_holes_filled
+from edslam_ti.sharp_images import SharpImages
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
@@ -37,16 +41,25 @@ class EventImages:
     """Log brightness at the times of frames, as events, depth and poses tell it.
 
     The start image is solved for every stretch, so that errors of the events (noise, a wrong threshold)
-    do not pile up, and tied to frames of earlier stretches. The absolute level is unknown.
+    do not pile up, and tied to frames of earlier stretches. The absolute level is unknown unless grey
+    images tell it.
     """
 
-    def __init__(self, camera: Camera, contrast: ContrastThreshold, config: MappingConfig) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        contrast: ContrastThreshold,
+        config: MappingConfig,
+        sharp_images: SharpImages | None = None,  # None: events alone
+    ) -> None:
         self.is_solved = False
         self._camera = camera
         self._contrast_threshold = contrast.value
         self._config = config
+        self._sharp_images = sharp_images
         self._archive = EventArchive(camera.shape, *contrast.relative)
         self._depths: dict[int, np.ndarray | None] = {}
+        self._grey: dict[int, np.ndarray] = {}  # [H, W] log brightness by frame, nan = unknown
         self._stretches: list[_Stretch] = []
         self._num_events = np.zeros(camera.shape, np.float32)
         # Pixels that fire by themselves; neighbours stand in for them.
@@ -73,6 +86,7 @@ class EventImages:
         self._find_hot_pixels(frame.events)
         if not frame.is_held_out:
             self._depths[index] = frame.depth
+            self._take_in_grey(frame, index)
         if not self._stretches:
             level = np.float32(np.log(self._config.background))
             self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
@@ -81,8 +95,17 @@ class EventImages:
             self._begin(index + 1, frame.timestamp, self._stretches[-1].start + change)
 
     def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
-        """Return the image at a frame."""
-        return self._stretch(index).start + self._change(index)
+        """Return the image at a frame: from the nearest grey image of its stretch on, else from the start."""
+        stretch, change = self._stretch(index), self._change(index)
+        image = stretch.start + change
+        with_grey = [k for k in self._grey if self._stretch(k) is stretch]
+        if not with_grey:
+            return image
+        nearest = min(with_grey, key=lambda k: abs(k - index))
+        grey = self._grey[nearest]
+        if nearest != index:
+            grey = grey + change - self._change(nearest)
+        return np.where(np.isnan(grey), image, grey)
 
     def solve(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
         """Solve the newest start image (thorough: all of them); return whether there was enough to do so."""
@@ -100,20 +123,29 @@ class EventImages:
                 change = (solved.log_brightness - stretch.start)[solved.is_observed]
                 solved.log_brightness[:] -= np.median(change) if len(change) else np.float32(0)
             stretch.start = solved.log_brightness
+            self._tie_to_grey(stretch, own)
             self.is_solved = True
         return self.is_solved
 
     def take_over_details(self, index: int, difference: np.ndarray) -> None:
         """Move details of a start image towards the map's, which has seen them from many sides.
 
-        `difference` [H, W]: log brightness of the map less the image at the frame.
+        `difference` [H, W]: log brightness of the map less the image at the frame. Grey images have their
+        own details.
         """
+        if index in self._grey:
+            return
         details = difference - cv2.GaussianBlur(difference, (0, 0), DETAIL_SIGMA)
         stretch = self._stretch(index)
         stretch.start = stretch.start + DETAIL_RATE * details
 
     def set_white(self, brightness: float) -> float:
-        """Shift all images so that the brightest percent is at `brightness`; return the shift in log."""
+        """Shift all images so that the brightest percent is at `brightness`; return the shift in log.
+
+        Where grey images tell the level, it stays.
+        """
+        if self._grey:
+            return 0.0
         small = [block_means(self.log_brightness(k), 4) for k in self.frames]
         shift = float(np.log(brightness + self._config.log_epsilon) - np.percentile(small, 99))
         for stretch in self._stretches:
@@ -131,8 +163,29 @@ class EventImages:
             densest = min(candidates, key=lambda i: frames[i + 1] - frames[i - 1])
             self._archive.forget(frames[densest])
             del self._depths[frames[densest]]
+            self._grey.pop(frames[densest], None)
             in_use = {self._stretch(k).first for k in self.frames}
             self._stretches = [s for s in self._stretches[:-1] if s.first in in_use] + self._stretches[-1:]
+
+    def _take_in_grey(self, frame: Frame, index: int) -> None:
+        grey = None if self._sharp_images is None else self._sharp_images.log_brightness(frame)
+        if grey is not None:
+            grey[self.hot] = np.nan  # their events have spoilt what was made of the image
+            self._grey[index] = grey
+
+    def _tie_to_grey(self, stretch: _Stretch, frames: list[int]) -> None:
+        """Shift a start image to what the grey images of its frames say, pixel by pixel where they do."""
+        total, count = np.zeros(self._camera.shape, np.float32), np.zeros(self._camera.shape, np.float32)
+        for k in frames:
+            if k in self._grey:
+                shift = self._grey[k] - (stretch.start + self._change(k))
+                total += np.nan_to_num(shift)
+                count += ~np.isnan(shift)
+        if count.any():
+            known = total[count > 0] / count[count > 0]
+            shift = np.full_like(total, np.median(known))
+            shift[count > 0] = known
+            stretch.start = stretch.start + shift
 
     def _begin(self, first: int, time: float, start: np.ndarray) -> None:
         self._stretches.append(_Stretch(first, start.astype(np.float32)))

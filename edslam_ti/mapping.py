@@ -21,6 +21,7 @@ from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
 from edslam_ti.pointcloud import depth_to_points, surface_discs, with_holes_filled
 from edslam_ti.rendering import RenderOutput, View, drawable, render, render_view
+from edslam_ti.sharp_images import SharpImages
 from edslam_ti.trajectory import Trajectory
 
 Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
@@ -131,10 +132,17 @@ class GaussianMapper:
     """Gaussians from depth, optimised with the poses for what events say has changed since the beginning.
 
     Eq. 10 to 12 with t_k at the beginning of the stretch, where the image is unknown but the same for all its
-    frames: it is solved (brightness.py), and a step then compares a single view with start + change.
+    frames: it is solved (brightness.py), and a step then compares a single view with start + change. Grey
+    images, where given, stand in for the start.
     """
 
-    def __init__(self, camera: Camera, contrast: ContrastThreshold, config: Config) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        contrast: ContrastThreshold,
+        config: Config,
+        sharp_images: SharpImages | None = None,
+    ) -> None:
         self.gaussians = GaussianMap(config.mapping)
         self.keyframes: list[Keyframe] = []
         self.loss = float("nan")
@@ -142,7 +150,7 @@ class GaussianMapper:
         self._config = config.mapping
         self._keyframe_config = config.keyframes
         self._random = np.random.default_rng(config.seed + 1)
-        self.images = EventImages(camera, contrast, config.mapping)
+        self.images = EventImages(camera, contrast, config.mapping, sharp_images)
         self._order: list[int] = []  # frames still to come in this round of steps
         # Bundle adjustment refines tracked poses; true ones stay as they are.
         self._adjusts_poses = config.mapping.bundle_adjustment and config.poses == "tracked"

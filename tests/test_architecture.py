@@ -30,6 +30,7 @@ RANKS: list[list[str]] = [
             "edslam_ti.surface_frame",
             "edslam_ti.tracking",
             "edslam_ti.keyframes",
+            "edslam_ti.sharp_images",
             "edslam_ti.event_images",
         ),
         *(

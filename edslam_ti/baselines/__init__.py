@@ -28,6 +28,7 @@ def _ed_slam(
 ) -> tuple["Tracker", "Mapper"]:
     from edslam_ti.brightness_tracking import BrightnessTracker
     from edslam_ti.mapping import GaussianMapper
+    from edslam_ti.sharp_images import SharpImages
     from edslam_ti.tracking import BidirectionalPatchTracker
 
     tracker: Tracker
@@ -36,7 +37,8 @@ def _ed_slam(
         tracker = BrightnessTracker(sequence.camera, contrast, surfaces, tracking, config.seed)
     else:
         tracker = BidirectionalPatchTracker(sequence.camera, surfaces, tracking, config.seed)
-    return tracker, GaussianMapper(sequence.camera, contrast, config)
+    sharp_images = SharpImages(sequence, contrast, config.mapping) if config.mapping.frames else None
+    return tracker, GaussianMapper(sequence.camera, contrast, config, sharp_images)
 
 
 def _open3d_rgbd(

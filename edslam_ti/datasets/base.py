@@ -49,6 +49,7 @@ class EventDepthSequence(ABC):
     truth: Trajectory | None  # true poses
     depth_timestamps: np.ndarray  # [D] seconds, strictly increasing
     image_timestamps: np.ndarray  # [I] seconds, strictly increasing; may be empty
+    exposure: float | None = None  # seconds over which an image integrates, when the data states it
     description: str  # one line: what this is; a stand-in says so
     surfaces_file: Path | None = None  # true surfaces of a simulated scene, a PLY mesh; for evaluation only
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)

@@ -12,9 +12,9 @@
     surfaces.ply                               true surfaces, metres, optional
 
 NNNNNN is the time in milliseconds, with any number of digits. `camera.json` may hold any of {width,
-height, fx, fy, cx, cy, pixel_centres: "integer" | "half", contrast_threshold, depth_scale}; what it leaves
-out is EventReplica's own camera. With centres at "half" (EventReplica's, seen from cx = width / 2) the
-first pixel is centred at (0.5, 0.5); the sequence's `camera` has them at integers.
+height, fx, fy, cx, cy, pixel_centres: "integer" | "half", contrast_threshold, depth_scale, exposure};
+what it leaves out is EventReplica's own camera. With centres at "half" (EventReplica's, seen from cx =
+width / 2) the first pixel is centred at (0.5, 0.5); the sequence's `camera` has them at integers.
 
 Clock: the files' own, in seconds. A recording whose first event is later than `LATEST_START` (stamps
 since the epoch or since boot) is shifted so that it starts at 0; `time_offset` holds the shift.
@@ -59,6 +59,8 @@ class CameraFile(BaseModel):
     """C of Eq. 11; also chooses among several event folders."""
     depth_scale: float = Field(1000.0, gt=0)
     """Units of depth/*.png in a metre (1000: millimetres); below 1, metres in a unit (0.001: the same)."""
+    exposure: float | None = Field(None, ge=0, lt=1)
+    """Seconds over which an image integrates, centred on its time; 0: sharp."""
     description: str | None = None
     """What the recording is; simulated ones say so here, and results repeat it."""
 
@@ -126,6 +128,7 @@ class EventReplicaSequence(EventDepthSequence):
         calibration = read_camera(folder / "camera.json")
         self.description = description or calibration.description or f"EventReplica layout, {folder}"
         self.camera = calibration.camera
+        self.exposure = calibration.exposure
         self._metres_per_unit = calibration.metres_per_unit
         events_folder, self.contrast_threshold = _event_folder(
             folder, contrast_threshold, calibration.contrast_threshold

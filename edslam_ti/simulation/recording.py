@@ -307,6 +307,7 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "pixel_centres": "integer",
         "contrast_threshold": config.contrast_threshold,
         "depth_scale": DEPTH_UNITS_PER_METRE,
+        "exposure": config.exposure,
         "description": scene.description,
     }
     (folder / "camera.json").write_text(json.dumps(values, indent=2) + "\n")
