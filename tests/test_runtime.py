@@ -1,6 +1,10 @@
 """How Taichi is started: bounds checks on request, errors that say where, no silent change of device."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,3 +59,10 @@ def test_devices_that_are_unknown_or_not_there_are_refused() -> None:
     if not torch.cuda.is_available():
         with pytest.raises(RuntimeError, match="use --device cpu"):
             kernels.init("cuda")
+
+
+def test_a_process_leaves_its_compiled_kernels_to_the_next_one(tmp_path: Path) -> None:
+    code = "import kernels, numpy; kernels.init(); from kernels.time_surface import compile_kernels as c; c()"
+    environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
+    assert list(tmp_path.rglob("*.tic"))
