@@ -16,7 +16,7 @@ from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 from edslam_ti.keyframes import EventArchive
 from edslam_ti.pointcloud import with_holes_filled
-from edslam_ti.sharp_images import SharpImages
+from edslam_ti.sharp_images import SharpImage, SharpImages
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
@@ -59,7 +59,7 @@ class EventImages:
         self._sharp_images = sharp_images
         self._archive = EventArchive(camera.shape, *contrast.relative)
         self._depths: dict[int, np.ndarray | None] = {}
-        self._grey: dict[int, np.ndarray] = {}  # [H, W] log brightness by frame, nan = unknown
+        self._grey: dict[int, SharpImage] = {}  # by frame
         self._stretches: list[_Stretch] = []
         self._num_events = np.zeros(camera.shape, np.float32)
         # Pixels that fire by themselves; neighbours stand in for them.
@@ -102,10 +102,8 @@ class EventImages:
         if not with_grey:
             return image
         nearest = min(with_grey, key=lambda k: abs(k - index))
-        grey = self._grey[nearest]
-        if nearest != index:
-            grey = grey + change - self._change(nearest)
-        return np.where(np.isnan(grey), image, grey)
+        since = 0.0 if nearest == index else change - self._change(nearest)
+        return self._grey[nearest].imposed_on(image, since)
 
     def solve(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
         """Solve the newest start image (thorough: all of them); return whether there was enough to do so."""
@@ -168,9 +166,9 @@ class EventImages:
             self._stretches = [s for s in self._stretches[:-1] if s.first in in_use] + self._stretches[-1:]
 
     def _take_in_grey(self, frame: Frame, index: int) -> None:
-        grey = None if self._sharp_images is None else self._sharp_images.log_brightness(frame)
+        grey = None if self._sharp_images is None else self._sharp_images.at(frame)
         if grey is not None:
-            grey[self.hot] = np.nan  # their events have spoilt what was made of the image
+            grey.log_brightness[self.hot] = cv2.medianBlur(grey.log_brightness, 5)[self.hot]
             self._grey[index] = grey
 
     def _tie_to_grey(self, stretch: _Stretch, frames: list[int]) -> None:
@@ -178,9 +176,10 @@ class EventImages:
         total, count = np.zeros(self._camera.shape, np.float32), np.zeros(self._camera.shape, np.float32)
         for k in frames:
             if k in self._grey:
-                shift = self._grey[k] - (stretch.start + self._change(k))
-                total += np.nan_to_num(shift)
-                count += ~np.isnan(shift)
+                is_exact = self._grey[k].clipped == 0
+                shift = self._grey[k].log_brightness - (stretch.start + self._change(k))
+                total += np.where(is_exact, shift, np.float32(0))
+                count += is_exact
         if count.any():
             known = total[count > 0] / count[count > 0]
             shift = np.full_like(total, np.median(known))

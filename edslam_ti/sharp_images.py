@@ -9,6 +9,8 @@ al. 2019): with a the exposure's beginning and E(t) the change of log brightness
 at any time t near by, such as that of a frame, also where the image was taken a little before it.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from edslam_ti.config import MappingConfig
@@ -19,7 +21,21 @@ from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 
 SAME_TIME = 1e-3  # seconds; an image this close to a frame is of its time
-DARKEST, BRIGHTEST = 1.5 / 255, 253.5 / 255  # beyond, the image says only "black" or "white"
+DARKEST, BRIGHTEST = 1 / 255, 254 / 255  # an image that says so or beyond only bounds brightness
+
+
+@dataclass(frozen=True)
+class SharpImage:
+    """What a grey image says of log brightness."""
+
+    log_brightness: np.ndarray  # [H, W] float32
+    clipped: np.ndarray  # [H, W] int8: 0 it is this, -1 this or darker, 1 this or brighter
+
+    def imposed_on(self, image: np.ndarray, change: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return another estimate of log brightness [H, W] made to agree, `change` after this image."""
+        value = self.log_brightness + change
+        low = np.where(self.clipped < 0, np.float32(-np.inf), value)
+        return np.clip(image, low, np.where(self.clipped > 0, np.float32(np.inf), value))
 
 
 class SharpImages:
@@ -41,18 +57,15 @@ class SharpImages:
         self._exposure = config.exposure if config.exposure is not None else sequence.exposure or 0.0
         self._epsilon = np.float32(config.log_epsilon)
 
-    def log_brightness(self, frame: Frame) -> np.ndarray | None:
-        """Return log(brightness + epsilon) [H, W] float32 at a frame's time, nan where the image is clipped.
-
-        It is made of the last image taken in the frame's own event chunk; None without one.
-        """
+    def at(self, frame: Frame) -> SharpImage | None:
+        """Return log(brightness + epsilon) at a frame's time, None without an image in its event chunk."""
         taken = self._taken_in(frame)
         if taken is None:
             return None
         image, time = self._sequence.image(taken), float(self._sequence.image_timestamps[taken])
-        is_clipped = (image < DARKEST) | (image > BRIGHTEST)
+        clipped = (image >= BRIGHTEST).astype(np.int8) - (image <= DARKEST)
         log_image = np.log(image + self._epsilon) + self._correction(time, frame.timestamp, image.shape)
-        return np.where(is_clipped, np.float32(np.nan), log_image.astype(np.float32))
+        return SharpImage(log_image.astype(np.float32), clipped)
 
     def _taken_in(self, frame: Frame) -> int | None:
         """Return the last image in the frame's event chunk, which no other frame's chunk shares."""
