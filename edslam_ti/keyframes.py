@@ -6,7 +6,7 @@ import numpy as np
 
 from edslam_ti.config import KeyframeConfig
 from edslam_ti.events import Events
-from kernels.time_surface import accumulate_polarity
+from kernels.time_surface import count_events
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class EventArchive:
         positive: float = 1.0,  # what an event of either polarity stands for, in (mean) thresholds
         negative: float = 1.0,
     ) -> None:
-        self._worth = {1: self.STEPS * positive, -1: -self.STEPS * negative}  # units, not rounded: sums grow
+        # Units an event; not rounded, because sums grow
+        self._positive, self._negative = self.STEPS * positive, self.STEPS * negative
         self._level = np.zeros(shape, np.float32)  # units, of events since the beginning
         self._last = np.zeros(shape, np.int16)  # units, towards which the last event leans
         self._last_frame = np.zeros(shape, np.int32)  # frames up to this one know their next event
@@ -62,24 +63,24 @@ class EventArchive:
     def append(self, events: Events, index: int, is_kept: bool) -> None:
         """Add the events up to frame `index`; keep the change up to it, if wanted."""
         shape = self._level.shape
-        pixel = events.y.astype(np.int64) * shape[1] + events.x
-        lean = np.where(events.polarity > 0, self._worth[1], self._worth[-1]) * self.LEAN
-        lean = np.rint(lean).astype(np.int16)
-        next_lean = np.zeros(shape, np.int16)
-        next_lean.ravel()[pixel[::-1]] = lean[::-1]  # of repeated pixels the first one stays
-        fired = np.flatnonzero(next_lean)
-        self._lean_towards_next(fired, next_lean.ravel()[fired])
-        for polarity, worth in self._worth.items():
-            events_of = events.polarity == polarity
-            x, y = events.x[events_of], events.y[events_of]
-            ones = np.ones(len(x), np.int8)
-            self._level += (
-                np.float32(worth) * accumulate_polarity(x, y, ones, np.array([0, len(x)]), shape)[0]
-            )
-        self._last.ravel()[pixel] = lean  # of repeated pixels the last one stays
+        first, last = np.zeros(shape, np.int8), np.zeros(shape, np.int8)  # polarities, 0 where silent
+        # Of repeated pixels the last one stays: backwards, the first event.
+        first.ravel()[(events.y.astype(np.int64) * shape[1] + events.x)[::-1]] = events.polarity[::-1]
+        counts = np.zeros((*shape, 2), np.int32)
+        count_events(events.x, events.y, events.polarity, counts, last)
+        fired = np.flatnonzero(first)
+        self._lean_towards_next(fired, self._lean(first.ravel()[fired]))
+        self._level += np.float32(self._positive) * counts[..., 1]
+        self._level -= np.float32(self._negative) * counts[..., 0]
+        self._last.ravel()[fired] = self._lean(last.ravel()[fired])
         self._last_frame.ravel()[fired] = index
         if is_kept:
             self._images[index] = np.rint(self._level).astype(np.int16) + self._last
+
+    def _lean(self, polarity: np.ndarray) -> np.ndarray:  # [P] -> [P] int16
+        """Return by how many units brightness is beyond an event's level."""
+        worth = np.where(polarity > 0, self._positive, -self._negative)
+        return np.rint(self.LEAN * worth).astype(np.int16)
 
     def _lean_towards_next(self, pixels: np.ndarray, lean: np.ndarray) -> None:
         """Let the kept images since each pixel's last event, mostly few, lean [P] towards its next one."""

@@ -37,7 +37,7 @@ from kernels.patch_warp import (
 )
 from kernels.projection import MIN_ALPHA
 from kernels.rasterization import rasterize
-from kernels.time_surface import MANY_EVENTS, accumulate_polarity, time_surface, update_last_timestamps
+from kernels.time_surface import MANY_EVENTS, time_surface, update_last_timestamps
 from kernels.view_losses import compare_change, compare_view
 
 OURS = "Taichi"
@@ -502,7 +502,6 @@ def run_every_kernel() -> None:
         module.compile_kernels()
     x, t = np.zeros(MANY_EVENTS, np.int16), np.zeros(MANY_EVENTS)
     update_last_timestamps(x, x, t, np.zeros((1, 1)))
-    accumulate_polarity(x[:1], x[:1], np.ones(1, np.int8), np.array([0, 1]), (1, 1))
 
 
 def cold_start(threads: int, rounds: int) -> Iterator[Row]:

@@ -27,10 +27,11 @@ def time_surface(last: Tensor, t: float, decay: float) -> Tensor:
     return torch.exp(-(t - last) / decay).float()
 
 
-def accumulate_polarity(x: Tensor, y: Tensor, polarity: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Eq. 11 without the factor C: sum of polarities of every pixel."""
-    flat = torch.zeros(shape[0] * shape[1], dtype=torch.int16)
-    return flat.index_add_(0, y.long() * shape[1] + x.long(), polarity.to(torch.int16)).view(shape)
+def count_events(x: Tensor, y: Tensor, polarity: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Negative and positive events of every pixel [H, W, 2]: Eq. 11 is C times their difference."""
+    flat = torch.zeros(shape[0] * shape[1] * 2, dtype=torch.int32)
+    place = 2 * (y.long() * shape[1] + x.long()) + (polarity > 0).long()
+    return flat.index_add_(0, place, torch.ones(len(x), dtype=torch.int32)).view(*shape, 2)
 
 
 # --- patches ---

@@ -1,6 +1,6 @@
 """Time surface (Eq. 1) and accumulated polarity (Eq. 11) of an event stream.
 
-T(x, t) = exp(-(t - t_last(x)) / tau),    E(x) / C = sum of p_i over the events at x in an interval
+T(x, t) = exp(-(t - t_last(x)) / tau),    E(x) = C+ n+(x) - C- n-(x), n the events at x of either polarity
 """
 
 import functools
@@ -49,25 +49,6 @@ def _newest_events(
                     if ti.static(by_polarity):
                         pixel += ti.select(polarity[i] > 0, height * width, 0)
                     newest[pixel] = i
-
-
-@ti.kernel
-def _accumulate_polarity(
-    x: ti.types.ndarray(ti.i16, ndim=1),  # [N]
-    y: ti.types.ndarray(ti.i16, ndim=1),  # [N]
-    polarity: ti.types.ndarray(ti.i8, ndim=1),  # [N]
-    first: ti.types.ndarray(ti.i64, ndim=1),  # [B + 1] interval b holds events first[b] .. first[b + 1]
-    num_workers: ti.i32,
-    sums: ti.types.ndarray(ti.i16, ndim=3),  # out [B, H, W], zeros in
-):
-    # An interval belongs to one worker, so plain adds do not race.
-    for chunk in range(num_workers * CHUNK):
-        if chunk % CHUNK == 0:
-            intervals = sums.shape[0]
-            w = chunk // CHUNK
-            for b in range(intervals * w // num_workers, intervals * (w + 1) // num_workers):
-                for i in range(ti.cast(first[b], ti.i32), ti.cast(first[b + 1], ti.i32)):
-                    sums[b, y[i], x[i]] = sums[b, y[i], x[i]] + ti.cast(polarity[i], ti.i16)
 
 
 @ti.kernel
@@ -172,23 +153,6 @@ def time_surface(
     return np.exp(((last - t) / decay).astype(np.float32))
 
 
-def accumulate_polarity(
-    x: np.ndarray,  # [N] int16
-    y: np.ndarray,  # [N] int16
-    polarity: np.ndarray,  # [N] int8, -1 or +1
-    first: np.ndarray,  # [B + 1] int64 boundaries of the intervals in the event arrays
-    shape: tuple[int, int],  # (H, W)
-) -> np.ndarray:  # [B, H, W] int16
-    """Return the sum of polarities of every pixel in every interval: E(x) / C of Eq. 11."""
-    check_shape("y", y, x.shape)
-    check_shape("polarity", polarity, x.shape)
-    sums = np.zeros((len(first) - 1, *shape), np.int16)
-    if len(x):
-        _check_inside(x, y, shape)
-        _accumulate_polarity(x, y, polarity, np.asarray(first, np.int64), workers(), sums)
-    return sums
-
-
 def count_events(
     x: np.ndarray,  # [N] int16
     y: np.ndarray,  # [N] int16
@@ -196,7 +160,7 @@ def count_events(
     counts: np.ndarray,  # [H, W, 2] int32, changed in place: negative and positive events
     last: np.ndarray,  # [H, W] int8, changed in place: polarity of the newest event
 ) -> None:
-    """Add events to each pixel's numbers of either polarity, and note its newest one."""
+    """Add events to each pixel's numbers of either polarity (Eq. 11), and note its newest one."""
     check_shape("y", y, x.shape)
     check_shape("polarity", polarity, x.shape)
     check_shape("counts", counts, (*last.shape, 2))

@@ -6,7 +6,7 @@ import torch
 
 import kernels
 from kernels import reference
-from kernels.time_surface import MANY_EVENTS, accumulate_polarity, time_surface, update_last_timestamps
+from kernels.time_surface import MANY_EVENTS, count_events, time_surface, update_last_timestamps
 
 SHAPE = (12, 16)
 
@@ -45,17 +45,24 @@ def test_microseconds_survive_at_late_times() -> None:
     assert ratio == pytest.approx(1e-6, rel=1e-3)
 
 
-def test_polarity_sums_match_the_twin_in_every_interval() -> None:
-    x, y, t, polarity = make_events(2000, 1)
-    first = np.searchsorted(t, [0.0, 0.2, 0.2, 0.7, 1.1])
-    ours = accumulate_polarity(x, y, polarity, first, SHAPE)
-    for b in range(4):
-        part = slice(first[b], first[b + 1])
-        twin = reference.accumulate_polarity(
-            *map(torch.from_numpy, (x[part], y[part], polarity[part])), SHAPE
-        )
-        assert np.array_equal(ours[b], twin.numpy())
-    assert ours[1].any() == False  # noqa: E712  (an empty interval)
+def test_numbers_of_events_match_the_twin_and_the_newest_polarity_stays() -> None:
+    x, y, _, polarity = make_events(2000, 1)
+    counts, last = np.zeros((*SHAPE, 2), np.int32), np.zeros(SHAPE, np.int8)
+    for part in (slice(0, 700), slice(700, 700), slice(700, 2000)):  # one of them empty
+        count_events(x[part], y[part], polarity[part], counts, last)
+    twin = reference.count_events(*map(torch.from_numpy, (x, y, polarity)), SHAPE)
+    assert np.array_equal(counts, twin.numpy())
+    expected = np.zeros(SHAPE, np.int8)
+    expected[y, x] = polarity  # of repeated pixels the last one stays
+    assert np.array_equal(last, expected)
+
+
+def test_events_outside_the_image_are_not_counted() -> None:
+    counts, last = np.zeros((*SHAPE, 2), np.int32), np.zeros(SHAPE, np.int8)
+    place = np.array([16], np.int16)
+    with pytest.raises(ValueError, match="0 <= x < 16"):
+        count_events(place, place, np.ones(1, np.int8), counts, last)
+    assert not counts.any()
 
 
 def test_events_outside_the_image_are_refused() -> None:
