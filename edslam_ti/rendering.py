@@ -104,6 +104,23 @@ def reduced_low_pass(reduction: int) -> float:
 def render_view(
     gaussians: GaussianMap, camera: Camera, T_world_camera: np.ndarray, background: float
 ) -> View:
-    """Return a view as arrays, with expected depth."""
-    output = render(gaussians.activated(), camera, torch.from_numpy(T_world_camera), background)
-    return View(output.intensity.numpy(), output.expected_depth.numpy(), output.alpha.numpy())
+    """Return a view as arrays, with median depth."""
+    shown, T = gaussians.activated(), torch.from_numpy(T_world_camera)
+    output = render(shown, camera, T, background)
+    return View(output.intensity.numpy(), median_depth(shown, output, T).numpy(), output.alpha.numpy())
+
+
+def median_depth(
+    gaussians: Gaussians,
+    output: RenderOutput,
+    T_world_camera: Tensor,  # [4, 4]
+) -> Tensor:  # [H, W] metres, 0 = nothing drawn
+    """Return the depth of the Gaussian at which half of the light is gone, as in Huang et al. 2024 (2DGS).
+
+    At an outline expected depth lies between two surfaces, where there is nothing. Where more than half of
+    the light passes, there is no median, and it is the expected depth.
+    """
+    _, _, row, _ = inverse(T_world_camera).float()
+    depth = gaussians.means @ row[:3] + row[3]
+    in_front = depth[output.dominant.clamp_min(0).long()] if len(depth) else output.depth
+    return torch.where(output.dominant >= 0, in_front, output.expected_depth)

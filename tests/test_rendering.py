@@ -72,6 +72,25 @@ def test_camera_that_steps_back_sees_the_wall_farther_away() -> None:
     np.testing.assert_allclose(view.depth[10:-10, 10:-10], 2.5, rtol=1e-4)
 
 
+def test_median_depth_is_that_of_a_surface_even_at_an_outline() -> None:
+    both = wall(2.0)
+    both.raw["means"].data[:, 0] -= 2.0  # its outline in the middle of the view
+    behind = wall(3.0)
+    both.add(*(getattr(behind.activated(), name).detach() for name in ("means", "quats", "scales")), 0.95,
+             behind.activated().colors.detach())  # fmt: skip
+    T = np.eye(4)
+    depth = render_view(both, CAMERA, T, background=0.5).depth
+    expected = render(both.activated(), CAMERA, torch.from_numpy(T), 0.5).expected_depth
+
+    def between(depth: np.ndarray) -> int:
+        return int(((depth > 2.1) & (depth < 2.9)).sum())
+
+    assert between(depth) == 0
+    assert between(expected.detach().numpy()) >= CAMERA.height  # a skirt
+    assert depth[24, 16] == 2.0
+    assert depth[24, 48] == 3.0
+
+
 def test_half_size_image_is_the_mean_of_blocks() -> None:
     gaussians = wall(2.0, spacing=0.2).activated()  # 4 pixels apart
     with torch.no_grad():
