@@ -1,6 +1,6 @@
 """Images from events: the start image of a stretch of a few seconds, and what has changed since (Eq. 11).
 
-Where grey images are taken in, too, what has changed counts from the nearest of them.
+Grey images, where they are taken in, too, are such images themselves and tell what the start image is.
 """
 
 from dataclasses import dataclass
@@ -95,15 +95,9 @@ class EventImages:
             self._begin(index + 1, frame.timestamp, self._stretches[-1].start + change)
 
     def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
-        """Return the image at a frame: from the nearest grey image of its stretch on, else from the start."""
-        stretch, change = self._stretch(index), self._change(index)
-        image = stretch.start + change
-        with_grey = [k for k in self._grey if self._stretch(k) is stretch]
-        if not with_grey:
-            return image
-        nearest = min(with_grey, key=lambda k: abs(k - index))
-        since = 0.0 if nearest == index else change - self._change(nearest)
-        return self._grey[nearest].imposed_on(image, since)
+        """Return the image at a frame, with what its grey image says where it has one."""
+        image = self._stretch(index).start + self._change(index)
+        return self._grey[index].imposed_on(image) if index in self._grey else image
 
     def solve(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
         """Solve the newest start image (thorough: all of them); return whether there was enough to do so."""

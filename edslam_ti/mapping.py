@@ -133,7 +133,7 @@ class GaussianMapper:
 
     Eq. 10 to 12 with t_k at the beginning of the stretch, where the image is unknown but the same for all its
     frames: it is solved (brightness.py), and a step then compares a single view with start + change. Grey
-    images, where given, stand in for the start.
+    images, where given, are such views themselves and tell what the start is.
     """
 
     def __init__(

@@ -31,11 +31,11 @@ class SharpImage:
     log_brightness: np.ndarray  # [H, W] float32
     clipped: np.ndarray  # [H, W] int8: 0 it is this, -1 this or darker, 1 this or brighter
 
-    def imposed_on(self, image: np.ndarray, change: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return another estimate of log brightness [H, W] made to agree, `change` after this image."""
-        value = self.log_brightness + change
-        low = np.where(self.clipped < 0, np.float32(-np.inf), value)
-        return np.clip(image, low, np.where(self.clipped > 0, np.float32(np.inf), value))
+    def imposed_on(self, image: np.ndarray) -> np.ndarray:
+        """Return another estimate of log brightness [H, W] made to agree with this one."""
+        low = np.where(self.clipped < 0, np.float32(-np.inf), self.log_brightness)
+        high = np.where(self.clipped > 0, np.float32(np.inf), self.log_brightness)
+        return np.clip(image, low, high)
 
 
 class SharpImages:

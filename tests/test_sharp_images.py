@@ -17,9 +17,10 @@ from edslam_ti.events import Events
 from edslam_ti.frame import Frame, FrameBuilder
 from edslam_ti.mapping import GaussianMapper
 from edslam_ti.sharp_images import SharpImages, change_from_mean
+from edslam_ti.trajectory import Trajectory
 
 THRESHOLD = ContrastThreshold(0.1, "data")
-HELD_OUT = {2, 7, 12}
+HELD_OUT = {2, 7}
 
 
 def frames_of(sequence: EventDepthSequence) -> list[Frame]:
@@ -103,14 +104,19 @@ class Rare(EventReplicaSequence):
         return super().image(4 * index + 1)
 
 
-def test_between_images_events_carry_on_from_the_nearest(
+def test_between_images_events_carry_on(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     assert isinstance(tiny_sequence, EventReplicaSequence)
     rare, config = Rare(tiny_sequence._folder), MappingConfig(max_views=10)
     images = EventImages(rare.camera, THRESHOLD, config, SharpImages(rare, THRESHOLD, config))
+    trajectory = Trajectory()
     for k, frame in enumerate(frames_of(rare)):
         images.append(frame, k)
+        T = tiny_samples[k].T_world_camera
+        assert T is not None
+        trajectory.append(frame.timestamp, T)
+    assert images.solve(trajectory, is_thorough=True)
     images.thin_out(keep=set())
     assert len(images.frames) == 10
     errors = []
@@ -118,7 +124,7 @@ def test_between_images_events_carry_on_from_the_nearest(
         truth = tiny_samples[k].image
         assert truth is not None
         errors.append(float(np.sqrt(np.mean((images.log_brightness(k) - np.log(truth + 0.004)) ** 2))))
-    assert max(errors) < 0.07  # 0.046 was measured
+    assert max(errors) < 0.07  # 0.042 was measured
 
 
 class Watched(EventReplicaSequence):
@@ -158,9 +164,9 @@ def test_images_fix_the_level_and_those_of_held_out_frames_stay_unused(
 ) -> None:
     assert isinstance(tiny_sequence, EventReplicaSequence)
     watched = Watched(tiny_sequence._folder)
-    _, raw, corrected = mapped(tiny_sequence, tiny_samples, frames=False)
-    _, raw_with, corrected_with = mapped(watched, tiny_samples, frames=True)
-    assert raw_with > raw + 3  # 24.3 and 31.1 dB were measured
+    _, raw, corrected = mapped(tiny_sequence, tiny_samples[:10], frames=False)
+    _, raw_with, corrected_with = mapped(watched, tiny_samples[:10], frames=True)
+    assert raw_with > raw + 3  # 18.1 and 30.8 dB were measured
     assert corrected_with > corrected + 1
     assert raw_with > corrected_with - 1
     held_out = {int(np.abs(watched.image_timestamps - tiny_samples[k].timestamp).argmin()) for k in HELD_OUT}
