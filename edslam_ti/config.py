@@ -122,7 +122,7 @@ class MappingConfig(Stage):
     (camera.json), else 0: images are sharp."""
     event_weight: float = Field(1.0, ge=0)
     """lambda_event of Eq. 16 (paper: 0.7)."""
-    depth_weight: float = Field(0.75, ge=0)
+    depth_weight: float = Field(2.0, ge=0)
     """lambda_d of Eq. 16 (paper: 0.05)."""
     scale_weight: float = Field(0.01, ge=0)
     """lambda_reg of Eq. 16 (paper: 0.25)."""

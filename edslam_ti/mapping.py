@@ -19,7 +19,7 @@ from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
-from edslam_ti.pointcloud import depth_to_points, surface_discs, with_holes_filled
+from edslam_ti.pointcloud import beside_steps, depth_to_points, surface_discs, with_holes_filled
 from edslam_ti.rendering import RenderOutput, View, drawable, render, render_view
 from edslam_ti.sharp_images import SharpImages
 from edslam_ti.trajectory import Trajectory
@@ -31,6 +31,7 @@ ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted,
 WHITE = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between solutions of the start image
 MAX_RECOLOURED = 24  # frames looked at for the brightness that such a solution gives Gaussians
+FINER = 2  # times closer are new Gaussians beside steps of depth
 FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
 MAX_STRETCH = 4.0  # of a new Gaussian on a surface that falls away
 SETTLING = (0.002, 0.1)  # metres, degrees: poses that change by less are only being refined
@@ -275,7 +276,7 @@ class GaussianMapper:
         T_world_camera: np.ndarray,  # [4, 4]
         view: RenderOutput,
     ) -> None:
-        """Add Gaussians at the pixels that Eq. 13 selects, one per stride x stride block.
+        """Add Gaussians at the pixels that Eq. 13 selects, one per stride x stride block, closer at outlines.
 
         So are pixels without depth where the map shows nothing, at the depth that is assumed there.
         """
@@ -287,16 +288,15 @@ class GaussianMapper:
         mask |= (depth <= 0) & (alpha < config.min_visibility)
         is_measured, depth = depth > 0, with_holes_filled(depth)
         s = stride_in_room(config.pixel_stride, len(self.gaussians) / config.max_gaussians)
-        grid = np.zeros_like(mask)
-        grid[s // 2 :: s, s // 2 :: s] = True
-        points, pixels = depth_to_points(depth, self._camera, T_world_camera, mask & grid)
+        spacing = np.where(beside_steps(depth), max(s // FINER, 1), s)
+        points, pixels = depth_to_points(depth, self._camera, T_world_camera, mask & spaced(spacing))
         room = config.max_gaussians - len(self.gaussians)
         points, pixels = points[:room], pixels[:room]
         if len(points) == 0:
             return
         x, y = pixels[:, 0], pixels[:, 1]
         # Discs on the surface; small ones sharpen faster than large ones shrink, and Eq. 13 fills the gaps.
-        size = config.initial_size * s * depth[y, x] / self._camera.fx
+        size = config.initial_size * spacing[y, x] * depth[y, x] / self._camera.fx
         quats, stretch = surface_discs(depth, self._camera, T_world_camera, pixels, MAX_STRETCH)
         scales = size[:, None] * np.stack([np.ones_like(size), stretch, np.full_like(size, FLATNESS)], 1)
         if self.images.is_solved:
@@ -443,6 +443,14 @@ def stride_in_room(
     """
     room = min(1.0, 2 * (1 - fullness))
     return math.ceil(stride / math.sqrt(max(room, 1e-3)))
+
+
+def spaced(
+    spacing: np.ndarray,  # [H, W] int, pixels
+) -> np.ndarray:  # [H, W] bool
+    """Return one pixel of every block that is as wide and high as the spacing."""
+    y, x = np.ogrid[: spacing.shape[0], : spacing.shape[1]]
+    return (y % spacing == spacing // 2) & (x % spacing == spacing // 2)
 
 
 def densify_mask(

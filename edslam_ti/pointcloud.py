@@ -10,6 +10,7 @@ from edslam_ti.open3d_loader import load_open3d
 HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
 FAR_SIDE = 90  # percentile of the depth around a hole
 BEHIND = 1.25  # times that is assumed in it: what is too near would hide surfaces measured later
+STEP = 0.03  # second difference of depth, as a share of it, from which neighbours are two surfaces
 FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
 
 
@@ -72,6 +73,16 @@ def surface_discs(
     x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3] @ axes).as_quat().T
     stretch = 1 / np.maximum(cosine, 1 / max_stretch)
     return np.stack([w, x, y, z], -1).astype(np.float32), stretch.astype(np.float32)
+
+
+def beside_steps(
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+) -> np.ndarray:  # [H, W] bool
+    """Return the pixels beside which depth jumps or ends: outlines, but no slanted surface."""
+    padded = np.pad(depth, 1, mode="reflect", reflect_type="odd")  # goes on as it does
+    across = padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * depth
+    down = padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * depth
+    return np.maximum(np.abs(across), np.abs(down)) > STEP * depth
 
 
 def with_holes_filled(

@@ -52,7 +52,7 @@ from edslam_ti.visualization import plot_trajectory
 from edslam_ti.volume import without_depth_edges
 
 MESH_VOXEL = 0.02  # metres
-MESH_ALPHA = 0.9  # pixels less opaque are left out of the mesh
+MESH_ALPHA = 0.5  # pixels less opaque, which have no median depth, are left out of the mesh
 MESH_STEP, MESH_TURN = 0.1, 5.0  # metres, degrees between the views that are fused
 CONTACT_ROWS = {"held out": 6, "mapped": 0, "novel": 6}  # of the contact sheet
 VIDEO_FPS = 15.0

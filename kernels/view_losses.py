@@ -5,9 +5,10 @@ images are written, alpha is computed once, and the backward pass neither divide
 projection, one sort and one launch serve all views.
 
     two views, Eq. 10-12:  L = s sum (log((I_end + eps) / (I_start + eps)) - measured)^2
-    one view:              L = s_e sum (log(I + eps) - target)^2 + s_d sum_{measured > 0} |D - measured|
+    one view:              L = s_e sum (log(I + eps) - target)^2 + s_d sum_{measured > 0} |D - A measured|
 
-with I = sum_i c_i alpha_i T_i + T_end background, D = sum_i d_i alpha_i T_i (Eq. 8).
+with I = sum_i c_i alpha_i T_i + T_end background, D = sum_i d_i alpha_i T_i, A = 1 - T_end (Eq. 8), so that
+D - A measured = sum_i (d_i - measured) alpha_i T_i: what is transparent is no error of depth.
 """
 
 from dataclasses import dataclass
@@ -77,7 +78,7 @@ def composite(
 @ti.func
 def differentiate_block(
     record: ti.template(), items: ti.template(), space, block, number, x, y, kept: ti.template(),
-    grad_intensity, grad_depth, background,
+    grad_intensity, grad_depth, target_depth, background,
     near_grad: ti.template(),
 ):  # fmt: skip
     """Add to the gradients of the records; see `kernels.rasterization.draw_backward`."""
@@ -86,7 +87,8 @@ def differentiate_block(
         n = number - 1 - from_end
         at = space * items.shape[2] + items[space, block, n]
         alpha, weight = kept[space, n, ALPHA], kept[space, n, WEIGHT]
-        q = record[at, FEATURES] * grad_depth + record[at, FEATURES + 1] * grad_intensity - behind
+        q = record[at, FEATURES + 1] * grad_intensity - behind
+        q += (record[at, FEATURES] - target_depth) * grad_depth
         behind += alpha * q
         v = ti.select(alpha < MAX_ALPHA, weight * q, 0.0)  # min() passes no gradient where it cuts
         dx, dy = x - record[at, MEAN_X], y - record[at, MEAN_Y]
@@ -156,7 +158,7 @@ def _compare_views(
                             kept,
                         )  # fmt: skip
                         brightness[space + v] = intensity + T * background + epsilon
-                        depth_error = depth - target_depth[i]
+                        depth_error = depth - (1.0 - T) * target_depth[i]
                     ratio = brightness[space + V - 1]
                     if V == 2:
                         ratio = ratio / brightness[space]
@@ -170,7 +172,8 @@ def _compare_views(
                         slope = ti.select(v == V - 1, 2.0 * scale, -2.0 * scale) * r
                         differentiate_block(
                             near_record, items, space + v, block, number[space + v, block], x, y, kept,
-                            slope / brightness[space + v], depth_scale * sign, background, near_grad,
+                            slope / brightness[space + v], depth_scale * sign, target_depth[i], background,
+                            near_grad,
                         )  # fmt: skip
                 tile_losses[t, 0], tile_losses[t, 1] = squares, errors
                 for v in range(V):
@@ -269,7 +272,7 @@ def compare_view(
     background: float,  # brightness behind everything
     epsilon: float,
     scale: float,  # of the sum of squares
-    depth_scale: float,  # of the sum of absolute depth errors
+    depth_scale: float,  # of the sum of absolute depth errors, each weighted by alpha
     low_pass: float = LOW_PASS,
     tile: int = TILE,
     pixelwise: bool | None = None,  # render a pixel per thread and compare in torch; None: on a GPU
@@ -318,6 +321,6 @@ def _compare_rendered(
     difference = (logs[0] if len(logs) == 1 else logs[1] - logs[0]) - target
     loss = weights[0] * difference.square().sum()
     if len(views) == 1:
-        error = (views[0].depth - target_depth).abs()
+        error = (views[0].depth - views[0].alpha * target_depth).abs()
         loss = loss + weights[1] * torch.where(target_depth > 0, error, 0).sum()
     return Comparison(loss, difference.detach())

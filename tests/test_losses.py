@@ -49,7 +49,7 @@ def test_view_loss_is_the_losses_of_a_rendered_view(has_depth: bool) -> None:
     difference = torch.log(view.intensity + EPSILON) - target
     theirs = 2 * difference.square().mean()
     if depth is not None:
-        theirs = theirs + 0.5 * depth_loss(view.depth, depth)
+        theirs = theirs + 0.5 * depth_loss(view.depth, view.alpha, depth)
     torch.testing.assert_close(ours.difference, difference.detach(), atol=1e-5, rtol=1e-5)
     assert_close(gradients(gaussians, ours.loss), gradients(gaussians, theirs))
 
@@ -77,16 +77,23 @@ def test_event_loss_without_events_is_finite() -> None:
 
 def test_depth_loss_is_the_mean_absolute_error_of_measured_pixels() -> None:
     rendered = torch.tensor([[1.1, 2.0], [5.0, 2.7]], requires_grad=True)
-    loss = depth_loss(rendered, torch.tensor([[1.0, 2.0], [0.0, 3.0]]))
+    loss = depth_loss(rendered, torch.ones(2, 2), torch.tensor([[1.0, 2.0], [0.0, 3.0]]))
     torch.testing.assert_close(loss.detach(), torch.tensor(0.4 / 3))
     loss.backward()
     assert rendered.grad is not None
     assert rendered.grad[1, 0] == 0  # missing depth pulls at nothing
 
 
+def test_depth_loss_does_not_count_what_is_transparent() -> None:
+    alpha, measured = torch.tensor([[0.3, 0.99]]), torch.tensor([[2.0, 3.0]])
+    surface = torch.tensor([[2.0, 3.1]])
+    loss = depth_loss(alpha * surface, alpha, measured)
+    torch.testing.assert_close(loss, torch.tensor(0.099 / 2))
+
+
 def test_depth_loss_without_measured_pixels_is_zero_with_zero_gradient() -> None:
     rendered = torch.ones(2, 2, requires_grad=True)
-    loss = depth_loss(rendered, torch.zeros(2, 2))
+    loss = depth_loss(rendered, torch.ones(2, 2), torch.zeros(2, 2))
     loss.backward()
     assert float(loss.detach()) == 0
     assert rendered.grad is not None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 from sequences import TINY, tiny_room
 
@@ -15,10 +16,12 @@ from apps import reproduce
 from edslam_ti.baselines import METHODS
 from edslam_ti.camera import Camera
 from edslam_ti.command_line import UsageError
-from edslam_ti.config import Config
+from edslam_ti.config import Config, MappingConfig
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import ConfigError, DataError
+from edslam_ti.gaussians import GaussianMap
+from edslam_ti.keyframe_alignment import BrightnessKeyframe, Depth
 from edslam_ti.reproduce import runs
 from edslam_ti.reproduce.ablations import (
     ablation_cases,
@@ -28,7 +31,7 @@ from edslam_ti.reproduce.ablations import (
 )
 from edslam_ti.reproduce.altered import AlteredSequence, RepeatedSequence
 from edslam_ti.reproduce.cases import Case, Recording, Selection, all_cases, quick_cases
-from edslam_ti.reproduce.long_stream import FrameCost, measure, stretches, table
+from edslam_ti.reproduce.long_stream import FrameCost, held_bytes, measure, stretches, table
 from edslam_ti.reproduce.recordings import Recordings
 from edslam_ti.reproduce.report import insert_into, markdown, write_report
 from edslam_ti.reproduce.runs import Variant, methods_as_variants, result_file, run_all
@@ -108,9 +111,34 @@ def test_long_stream_reports_what_frames_cost(tiny_sequence: EventDepthSequence,
 
 
 def test_growth_is_counted_from_the_warm_up_on() -> None:
-    costs = [FrameCost(t, 0.2 if t < 15 else 0.3, 0.1, 0.1, 500 + t, int(1000 * t)) for t in range(20)]
+    costs = [
+        FrameCost(t, 0.2 if t < 15 else 0.3, 0.1, 0.1, 500 + t, int(1000 * t), 0.2 * t, 7.0, 0.1 * t)
+        for t in range(20)
+    ]
     text = table(stretches(costs, length=5.0))
-    assert "Since 10 s: +10 MB with +10000 Gaussians, CPU time a frame +50 %." in text
+    parts = "map +2.0, frames +0.0, tracker +1.0, other +7.0"
+    assert f"Since 10 s: +10 MB with +10000 Gaussians ({parts}), CPU time a frame +50 %." in text
+
+
+def test_held_memory_counts_once_what_is_reached_twice() -> None:
+    depth = np.zeros((10, 20), np.float32)
+    keyframe = BrightnessKeyframe(
+        0, depth, Depth(depth, depth[::2]), Depth(depth, depth), np.ones(7), [torch.zeros(3)], None, 0
+    )
+    counted: set[int] = set()
+    assert held_bytes([keyframe, {"again": keyframe}], counted) == 10 * 20 * 4 + 7 * 8 + 3 * 4
+    assert held_bytes(depth[3:], counted) == 0
+    assert held_bytes(np.zeros(5), counted) == 5 * 8
+
+
+def test_a_gaussian_takes_two_hundred_bytes_with_its_moments() -> None:
+    gaussians = GaussianMap(MappingConfig())
+    empty = held_bytes(gaussians, set())
+    for _ in range(2):
+        m = torch.rand(100, 3)
+        gaussians.add(m, torch.rand(100, 4), torch.rand(100, 3), 0.5, torch.rand(100, 1))
+    # Raw parameters and two moments of each, 5 cells, the frame, and whether it was measured
+    assert held_bytes(gaussians, set()) - empty == 200 * (3 * 12 * 4 + 5 * 8 + 8 + 1)
 
 
 def test_a_path_that_does_not_close_is_not_played_again(tiny_sequence: EventDepthSequence) -> None:

@@ -80,7 +80,7 @@ def test_gaussians_from_one_depth_image_render_it_back(
     slam = make_slam(tiny_sequence, tiny_samples, settings(mapping={"initial_size": 0.6}))
     slam.process(tiny_samples[0])
     assert isinstance(slam.mapper, GaussianMapper)
-    assert slam.mapper.num_gaussians == 120 * 80 / 4  # one per 2x2 pixels
+    assert 120 * 80 / 4 < slam.mapper.num_gaussians < 120 * 80 / 3  # one per 2x2 pixels, more at outlines
     view = slam.mapper.render(tiny_sequence.camera, slam.trajectory.pose(0))
     assert tiny_samples[0].depth is not None
     assert np.mean(view.alpha > 0.8) > 0.95

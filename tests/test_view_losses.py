@@ -66,7 +66,7 @@ def change_twin(render, inputs: list[torch.Tensor], measured: torch.Tensor, scal
 def view_twin(render, inputs: list[torch.Tensor], target: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     *gaussians, poses = inputs
     view = render(*gaussians, poses[0], INTRINSICS, SIZE)
-    error = (view.depth - depth).abs()[depth > 0].sum()
+    error = (view.depth - view.alpha * depth).abs()[depth > 0].sum()
     return 0.7 * (torch.log(intensity(view) + EPSILON) - target).square().sum() + 0.2 * error
 
 
@@ -90,9 +90,8 @@ def test_one_view_with_depth_matches_rendering_it(pixelwise: bool) -> None:
     )  # fmt: skip
     theirs = with_gradients(view_twin(rasterize, inputs, target, depth), inputs)
     assert_same(with_gradients(result.loss, inputs), theirs, 2e-5)
-    depth_error = (
-        0.2 * (rasterize(*inputs[:-1], inputs[-1][0], INTRINSICS, SIZE).depth - depth).abs()[depth > 0]
-    )
+    view = rasterize(*inputs[:-1], inputs[-1][0], INTRINSICS, SIZE)
+    depth_error = 0.2 * (view.depth - view.alpha * depth).abs()[depth > 0]
     squares = 0.7 * result.difference.square().sum()
     assert float(result.loss.detach()) == pytest.approx(
         float((squares + depth_error.sum()).detach()), rel=1e-5

@@ -1,19 +1,24 @@
-"""What a long stream costs: time per frame, memory and the size of the map, against the seconds of data."""
+"""What a long stream costs: time per frame, memory and what it holds, against the seconds of data."""
 
 import csv
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
+from torch import Tensor
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
+from edslam_ti.mapping import GaussianMapper
 from edslam_ti.output import atomic_file
 from edslam_ti.pictures import new_figure, save_figure
 from edslam_ti.pipeline import contrast_of, held_out_frames, make_slam
+from edslam_ti.slam import Slam
 
 WARM_UP = 10.0  # seconds of data after which memory may grow by the map alone
 
@@ -28,6 +33,9 @@ class FrameCost:
     mapping_s: float  # wall time
     memory_mb: float  # resident
     num_gaussians: int
+    map_mb: float  # of that, the map with its optimiser's moments
+    frames_mb: float  # images from events, depth: what the mapper keeps of frames
+    tracker_mb: float  # its keyframes, old ones too, and recent frames
 
 
 def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameCost]:
@@ -46,7 +54,53 @@ def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameC
             slam.mapping_seconds - mapping,
             process.memory_info().rss / 2**20,
             0 if slam.mapper is None else slam.mapper.num_gaussians,
+            *_held_mb(slam),
         )
+
+
+def _held_mb(slam: Slam) -> tuple[float, float, float]:
+    """Return the MB of the map, of what else the mapper keeps, and of what the tracker keeps."""
+    counted: set[int] = set()  # what two of them hold counts for the first
+    gaussians = slam.mapper.gaussians if isinstance(slam.mapper, GaussianMapper) else None
+    held = [held_bytes(part, counted) / 2**20 for part in (gaussians, slam.mapper, slam.tracker)]
+    return held[0], held[1], held[2]
+
+
+def held_bytes(root: Any, counted: set[int]) -> int:
+    """Return the bytes of all arrays that can be reached from an object of ours, each memory once.
+
+    `counted`: addresses that have been counted before; those found are added. Mapped files do not count.
+    """
+    total, waiting, visited = 0, [root], set[int]()
+    while waiting:
+        value = waiting.pop()
+        if id(value) in visited:
+            continue
+        visited.add(id(value))
+        if isinstance(value, Tensor):
+            total += _newly_counted(
+                value.untyped_storage().data_ptr(), value.untyped_storage().nbytes(), counted
+            )
+        elif isinstance(value, np.ndarray):
+            while isinstance(value.base, np.ndarray):
+                value = value.base
+            if isinstance(value, np.memmap):
+                continue
+            total += _newly_counted(value.__array_interface__["data"][0], value.nbytes, counted)
+        elif isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, list | tuple | set | deque):
+            waiting += value
+        elif type(value).__module__.startswith(("edslam_ti", "kernels")):
+            waiting += vars(value).values() if hasattr(value, "__dict__") else ()
+    return total
+
+
+def _newly_counted(address: int, size: int, counted: set[int]) -> int:
+    """Return the size of what lies at an address, 0 if it has been counted."""
+    is_new = size > 0 and address not in counted
+    counted.add(address)
+    return size if is_new else 0
 
 
 @dataclass(frozen=True)
@@ -58,6 +112,14 @@ class Stretch:
     cpu_s: float  # a frame
     memory_mb: float
     num_gaussians: int
+    map_mb: float
+    frames_mb: float
+    tracker_mb: float
+
+    @property
+    def other_mb(self) -> float:
+        """Libraries, buffers of rendering, and what the allocator keeps for later."""
+        return self.memory_mb - self.map_mb - self.frames_mb - self.tracker_mb
 
 
 def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
@@ -72,6 +134,9 @@ def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
             float(np.mean([c.cpu_s for c in part])),
             part[-1].memory_mb,
             part[-1].num_gaussians,
+            part[-1].map_mb,
+            part[-1].frames_mb,
+            part[-1].tracker_mb,
         )
         for k, part in parts.items()
     ]
@@ -83,17 +148,22 @@ def table(rows: Sequence[Stretch]) -> str:
     CPU time of all threads: wall time says more about what else the machine does.
     """
     lines = [
-        "| seconds of data | Gaussians | resident MB | CPU s a frame |",
-        "|---|---|---|---|",
+        "| seconds of data | Gaussians | resident MB | map | frames | tracker | other | CPU s a frame |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     lines += [_line(row) for row in rows]
     warm = [r for r in rows if r.end <= WARM_UP]
     if warm and rows[-1].end > WARM_UP:
         first, last = warm[-1], rows[-1]
         num_new = last.num_gaussians - first.num_gaussians
+        parts = ", ".join(
+            f"{name} {getattr(last, f'{name}_mb') - getattr(first, f'{name}_mb'):+.1f}"
+            for name in ("map", "frames", "tracker", "other")
+        )
         lines += [
             "",
-            f"Since {first.end:g} s: {last.memory_mb - first.memory_mb:+.0f} MB with {num_new:+d} Gaussians, "
+            f"Since {first.end:g} s: {last.memory_mb - first.memory_mb:+.0f} MB with {num_new:+d} Gaussians "
+            f"({parts}), "
             f"CPU time a frame {100 * (last.cpu_s / first.cpu_s - 1):+.0f} %.",
         ]
     return "\n".join(lines) + "\n"
@@ -102,6 +172,7 @@ def table(rows: Sequence[Stretch]) -> str:
 def _line(row: Stretch) -> str:
     return (
         f"| {row.start:g} to {row.end:g} | {row.num_gaussians / 1000:.0f}k | {row.memory_mb:.0f} | "
+        f"{row.map_mb:.1f} | {row.frames_mb:.1f} | {row.tracker_mb:.1f} | {row.other_mb:.0f} | "
         f"{row.cpu_s:.2f} |"
     )
 
