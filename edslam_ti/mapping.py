@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.densification import Densifier
 from edslam_ti.event_images import EventImages, evenly
 from edslam_ti.frame import Frame
-from edslam_ti.gaussians import GaussianMap, Gaussians
+from edslam_ti.gaussians import GaussianMap
 from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
@@ -245,8 +246,7 @@ class GaussianMapper:
         assert frame.depth is not None
         T = trajectory.pose(index)
         candidate = Keyframe(index, frame.timestamp)
-        with torch.no_grad():
-            view = self._render(self.gaussians.activated(), torch.from_numpy(T))
+        view = self._render(T)
         if not self.keyframes or self._is_keyframe(candidate, frame.depth, view.visible, trajectory):
             self.keyframes.append(candidate)
         self._add_gaussians(index, frame.depth, T, view)
@@ -260,8 +260,7 @@ class GaussianMapper:
     ) -> bool:
         last = self.keyframes[-1]
         T_last, T_now = trajectory.pose(last.index), trajectory.pose(frame.index)
-        with torch.no_grad():
-            seen = self._render(self.gaussians.activated(), torch.from_numpy(T_last)).visible
+        seen = self._render(T_last).visible
         union = int((visible | seen).sum())
         covisibility = int((visible & seen).sum()) / max(union, 1)
         translation = float(np.linalg.norm(T_now[:3, 3] - T_last[:3, 3]))
@@ -357,20 +356,18 @@ class GaussianMapper:
         n = len(self.gaussians)
         total, count = np.zeros(n), np.zeros(n)
         epsilon = self._config.log_epsilon
-        with torch.no_grad():
-            gaussians = self.gaussians.activated()
-            for k in frames:
-                view = self._render(gaussians, torch.from_numpy(trajectory.pose(k)))
-                seen = view.dominant.numpy().ravel()
-                old = before[k] if k in before else np.log(view.intensity.numpy() + epsilon)
-                change = (self.images.log_brightness(k) - old).ravel()
-                drawn = seen >= 0
-                total += np.bincount(seen[drawn], change[drawn], n)
-                count += np.bincount(seen[drawn], minlength=n)
+        for k in frames:
+            view = self._render(trajectory.pose(k))
+            seen = view.dominant.numpy().ravel()
+            old = before[k] if k in before else np.log(view.intensity.numpy() + epsilon)
+            change = (self.images.log_brightness(k) - old).ravel()
+            drawn = seen >= 0
+            total += np.bincount(seen[drawn], change[drawn], n)
+            count += np.bincount(seen[drawn], minlength=n)
         if count.any():
             everywhere = total.sum() / count.sum() if frames[0] <= self.images.frames[0] else 0.0
             change = np.where(count > 0, total / np.maximum(count, 1), everywhere)
-            level = np.log(gaussians.colors.numpy()[:, 0] + epsilon) + change
+            level = np.log(self.points()[1] + epsilon) + change
             self.gaussians.set_colors(torch.from_numpy((np.exp(level) - epsilon).astype(np.float32))[:, None])
 
     def _optimise(
@@ -417,8 +414,17 @@ class GaussianMapper:
         value = float(view.difference.square().mean()) / EVENT_VARIANCE
         self.loss = value if np.isnan(self.loss) else 0.95 * self.loss + 0.05 * value
 
-    def _render(self, gaussians: Gaussians, T_world_camera: Tensor) -> RenderOutput:
-        return render(gaussians, self._camera, T_world_camera, self._config.background)
+    @torch.no_grad()
+    def _render(self, T_world_camera: np.ndarray) -> RenderOutput:  # [4, 4]
+        """Return the map seen from a pose; what is out of view takes neither time nor memory."""
+        T = torch.from_numpy(T_world_camera)
+        chosen = drawable(self.gaussians, self._camera, T)
+        view = render(self.gaussians.part(chosen).activated(), self._camera, T, self._config.background)
+        visible = torch.zeros(len(self.gaussians), dtype=torch.bool)
+        visible[chosen] = view.visible
+        # Indices of the part to those of the map; -1, the last one here, stays -1.
+        of_map = torch.cat([chosen, torch.tensor([-1])]).int()
+        return replace(view, visible=visible, dominant=of_map[view.dominant.long()])
 
     def _draw_recent(self) -> int:
         """Draw a frame, half of the time one of the newest."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from sequences import make_slam, settings
 
 from edslam_ti.datasets import EventDepthSequence, Sample
@@ -12,6 +13,7 @@ from edslam_ti.evaluation import depth_l1_cm, evaluate_images
 from edslam_ti.geometry import exp_matrix
 from edslam_ti.mapping import GaussianMapper, PoseRefiner, densify_mask, spaced, stride_in_room
 from edslam_ti.pointcloud import beside_steps
+from edslam_ti.rendering import render
 from edslam_ti.slam import Slam
 from edslam_ti.tracking import TruePoses
 from edslam_ti.trajectory import Trajectory
@@ -136,6 +138,19 @@ def test_mapped_pixels_get_no_second_gaussians(
     _, all_of_them = mapped(tiny_sequence, tiny_samples, iterations=0)
     # 14 views of nearly the same walls: what is new is the gaps between small discs, the rim, behind edges.
     assert first.num_gaussians < all_of_them.num_gaussians < 4 * first.num_gaussians
+
+
+def test_view_of_what_may_show_is_that_of_the_whole_map(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:2], iterations=0, finish=False)
+    T = slam.trajectory.pose(0) @ exp_matrix(np.array([0.1, 0.0, -0.2, 0.1, 0.4, 0.0]))
+    with torch.no_grad():
+        whole = render(mapper.gaussians.activated(), mapper._camera, torch.from_numpy(T), 0.5)
+    part = mapper._render(T)
+    assert int((whole.dominant < 0).sum()) > 0  # turned so far that the map ends inside the view
+    for name in ("intensity", "depth", "alpha", "visible", "dominant"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)), name
 
 
 def test_map_never_exceeds_its_largest_size(
