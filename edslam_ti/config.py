@@ -100,7 +100,7 @@ class MappingConfig(Stage):
     """lambda_V of Eq. 13: pixels with less alpha get new Gaussians (Sec. IV-A)."""
     depth_error_factor: float = Field(50.0, gt=0)
     """lambda_MDE of Eq. 13: so many median depth errors also ask for new Gaussians (Sec. IV-A)."""
-    max_gaussians: int = Field(500_000, ge=1)
+    max_gaussians: int = Field(300_000, ge=1)
     """No Gaussians are added beyond this; beyond half of it, the fuller the map, the coarser the new ones."""
     initial_size: float = Field(0.25, gt=0)
     """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
