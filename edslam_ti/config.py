@@ -156,7 +156,7 @@ class MappingConfig(Stage):
     cells_rate: float = Field(2e-2, gt=0)
     """Adam's learning rate of the cells' brightness offsets."""
     bundle_adjustment: bool = True
-    """Optimise the frames' poses together with the map."""
+    """Optimise the frames' poses together with the map; align those without depth to it."""
     poses_rate: float = Field(2e-5, gt=0)
     """Adam's learning rate of poses, metres and radians."""
 

@@ -20,6 +20,7 @@ from edslam_ti.gaussians import GaussianMap
 from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
+from edslam_ti.map_alignment import MapAligner
 from edslam_ti.pointcloud import beside_steps, depth_to_points, surface_discs, with_holes_filled
 from edslam_ti.rendering import RenderOutput, View, drawable, render, render_view
 from edslam_ti.sharp_images import SharpImages
@@ -29,6 +30,7 @@ Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks
 
 ONLINE_SHARE = 0.5  # of the budget, for the steps while the map grows
 ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
+ALIGN_FROM = 0.5  # fraction of them after which frames without depth are aligned to the map, once
 WHITE = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between solutions of the start image
 MAX_RECOLOURED = 24  # frames looked at for the brightness that such a solution gives Gaussians
@@ -157,6 +159,7 @@ class GaussianMapper:
         # Bundle adjustment refines tracked poses; true ones stay as they are.
         self._adjusts_poses = config.mapping.bundle_adjustment and config.poses == "tracked"
         self._refiner = PoseRefiner(config.mapping.poses_rate)
+        self._aligner = MapAligner(camera, config.tracking)
         self._num_frames = 0
         self.budget = Budget(config.mapping.budget)
         self.num_steps = 0  # taken so far
@@ -201,7 +204,7 @@ class GaussianMapper:
     def _finish(self, trajectory: Trajectory, progress: Progress) -> None:
         if len(self.gaussians) == 0 or not self._solve_brightness(trajectory, is_thorough=True):
             return
-        allowed, done = self.budget.left(), 0.0
+        allowed, done, is_aligned = self.budget.left(), 0.0, not self._adjusts_poses
         densifier = self._densifier(trajectory) if self._config.densify else None
         for k in range(self._config.final_iterations):
             if done >= 1:
@@ -209,6 +212,9 @@ class GaussianMapper:
             rate = 0.05**done  # ends at a twentieth
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
+            if not is_aligned and done >= ALIGN_FROM:
+                self._align(trajectory)
+                is_aligned = True
             adjusts_poses = self._adjusts_poses and done >= ADJUST_FROM
             self._optimise(self._draw_any(), trajectory, adjusts_poses, densifier)
             if densifier is not None:
@@ -413,6 +419,17 @@ class GaussianMapper:
                 self._refiner.step(frame, delta.grad.numpy(), trajectory)
         value = float(view.difference.square().mean()) / EVENT_VARIANCE
         self.loss = value if np.isnan(self.loss) else 0.95 * self.loss + 0.05 * value
+
+    def _align(self, trajectory: Trajectory) -> None:
+        """Correct the poses of frames without depth by the map."""
+        for k in self.images.frames:
+            if self.images.depth(k) is None:
+                T = trajectory.pose(k)
+                view = self._render(T)
+                seen = np.log(view.intensity.numpy() + self._config.log_epsilon)
+                depth, alpha = view.expected_depth.numpy(), view.alpha.numpy()
+                image = self.images.log_brightness(k)
+                trajectory.replace(k, self._aligner.corrected(image, seen, depth, alpha, T))
 
     @torch.no_grad()
     def _render(self, T_world_camera: np.ndarray) -> RenderOutput:  # [4, 4]

@@ -270,7 +270,7 @@ def levenberg_marquardt(
     T, damping = T_world_camera, 1e-4
     system = linearise(T)
     for _ in range(iterations):
-        if system.num_surface < MIN_PIXELS:
+        if system.num_surface < MIN_PIXELS or system.cost == 0:
             break
         H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
         candidate_T = T @ exp_matrix(-np.linalg.solve(H, system.g))

@@ -39,6 +39,7 @@ RANKS: list[list[str]] = [
             "edslam_ti.pose_graph",
             "edslam_ti.brightness_tracking",
             "edslam_ti.densification",
+            "edslam_ti.map_alignment",
             "edslam_ti.mapping",
         ),
     ],
@@ -75,7 +76,8 @@ LIBRARIES: dict[str, list[str]] = {
     "cv2": [
         *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.surface_frame", "edslam_ti.pictures"),
         *("edslam_ti.brightness", "edslam_ti.contrast", "edslam_ti.event_images"),
-        *("edslam_ti.keyframe_alignment", "edslam_ti.place_recognition", "edslam_ti.pointcloud"),
+        *("edslam_ti.keyframe_alignment", "edslam_ti.map_alignment", "edslam_ti.place_recognition"),
+        "edslam_ti.pointcloud",
     ],
     "OpenEXR": ["edslam_ti.datasets.*"],
     "platformdirs": ["edslam_ti.datasets.*"],

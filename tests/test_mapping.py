@@ -296,6 +296,32 @@ def test_bundle_adjustment_moves_tracked_poses_but_not_the_first(
     assert 0 < moved[1:].max() < 0.001  # at most 20 steps of 20 um a coordinate
 
 
+def test_frames_without_depth_come_half_way_to_where_the_map_looks_like_their_images(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    sparse = [replace(s, depth=s.depth if k % 3 == 0 else None) for k, s in enumerate(tiny_samples)]
+    slam, mapper = mapped(tiny_sequence, sparse, final_iterations=30)
+    shift = exp_matrix(np.array([0.004, 0.003, 0, 0, 0, 0]))
+    true = slam.trajectory.poses
+    for k in range(1, len(sparse)):
+        slam.trajectory.replace(k, true[k] @ shift)
+    mapper._align(slam.trajectory)
+    error = np.linalg.norm(slam.trajectory.poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    with_depth = np.arange(len(sparse)) % 3 == 0
+    np.testing.assert_allclose(error[with_depth][1:], 0.005, rtol=1e-6)
+    assert 0.0015 < np.median(error[~with_depth]) < 0.0035
+
+
+def test_a_map_that_looks_otherwise_moves_no_pose(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:5])
+    nothing = np.zeros(tiny_sequence.camera.shape, np.float32)
+    T = np.eye(4)
+    assert (mapper._aligner.corrected(nothing, nothing, nothing + 2, nothing + 1, T) == T).all()  # no texture
+    assert (mapper._aligner.corrected(nothing, nothing, nothing, nothing, T) == T).all()  # no map
+
+
 def test_true_poses_are_not_adjusted(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
     slam, _ = mapped(tiny_sequence, tiny_samples[:6], final_iterations=6)
     truth = np.array([s.T_world_camera for s in tiny_samples[:6]])
