@@ -17,7 +17,7 @@ from edslam_ti.keyframe_alignment import Aligned, BrightnessKeyframe, Depth, Key
 from edslam_ti.motion_prior import MeasuredPose, MotionPrior
 from edslam_ti.place_recognition import recognised
 from edslam_ti.pose_graph import Revisit, corrections, spread
-from edslam_ti.tracking import MIN_PIXELS, BidirectionalPatchTracker, TrackingResult, best_attempt
+from edslam_ti.tracking import MIN_PIXELS, Attempt, BidirectionalPatchTracker, TrackingResult, best_attempt
 from edslam_ti.trajectory import Trajectory
 from kernels.patch_warp import NormalEquations
 
@@ -30,6 +30,7 @@ MIN_SOLVE_FRAMES = 3  # between two solutions for one keyframe
 SILENT_SHARE = 0.02  # fewer events than this share of the usual number: the camera or the stream stopped
 SLOWING_SHARE = 0.2  # fewer than this in the frame before: the camera was coming to rest
 SILENT_FLOW = 0.3  # pixels a frame: a camera this fast does not stop within one frame
+DOUBTFUL = 1.25  # times the usual misfit: the camera may have stopped where it was expected to go on
 MAX_MISFITS = 4  # such frames in a row after which the image is given up
 REVISIT_OVERLAP = 0.6  # share of an old keyframe's pixels that must be in view again
 REVISIT_MISFIT = 0.12  # log brightness, median
@@ -68,6 +69,7 @@ class BrightnessTracker:
         self._is_silent, self._silent_since = False, 0  # events are missing; first such frame
         self._usual_events, self._last_count = 0.0, 0
         self._num_misfits = 0
+        self._usual_misfit = np.inf  # log brightness; until the first image is aligned, any is usual
         self._motion = MotionPrior()
         self._settled: list[MeasuredPose] = []  # between the last two frames with depth, and these
         self._path = _Path(Trajectory())
@@ -90,9 +92,10 @@ class BrightnessTracker:
             if not self._is_silent and self._begin():
                 note = self._relocalise()
         else:
-            result, overlap = self._follow(moment, guess)
+            best = self._follow(moment, guess)
+            result = best.result
             self._path.newest = result.T_world_camera
-            note = note or self._keep_up(moment, result.converged, overlap)
+            note = note or self._keep_up(moment, result.converged, best.overlap)
         message = result.message or note
         return TrackingResult(self._path.newest, result.converged, result.quality, message)
 
@@ -175,14 +178,20 @@ class BrightnessTracker:
 
     # --- frame by frame ---
 
-    def _follow(self, moment: Moment, guess: np.ndarray) -> tuple[TrackingResult, float]:
+    def _follow(self, moment: Moment, guess: np.ndarray) -> Attempt:
         """Return the frame's pose and the share of the keyframe in view."""
 
-        def attempt(start: np.ndarray) -> tuple[TrackingResult, float]:
+        def attempt(start: np.ndarray) -> Attempt:
             aligned = self._align(moment, moment.depth, start)
-            return self._judged(aligned, guess), aligned.overlap
+            result = self._judged(aligned, guess)
+            is_sure = result.converged and aligned.misfit < DOUBTFUL * self._usual_misfit
+            return Attempt(result, is_sure, aligned.overlap, aligned.misfit)
 
-        return best_attempt(attempt, guess, self._path.pose(-1))
+        best = best_attempt(attempt, guess, self._path.pose(-1))
+        if best.result.converged:
+            usual = self._usual_misfit if np.isfinite(self._usual_misfit) else best.misfit
+            self._usual_misfit = 0.8 * usual + 0.2 * best.misfit
+        return best
 
     def _align(self, moment: Moment, depth: Depth | None, start: np.ndarray) -> Aligned:
         """Align a moment to the keyframe, with this depth; `start` is a T_world_camera."""

@@ -38,6 +38,16 @@ class TrackingResult:
     message: str = ""  # why it failed, or what else is worth the log
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """A result, and whether it needs no second one from another start."""
+
+    result: TrackingResult
+    is_sure: bool
+    overlap: float  # share of the reference in view
+    misfit: float = 0.0  # median absolute difference of log brightness
+
+
 class Tracker(Protocol):
     """Finds the pose of a frame; the first frame gets the pose it is expected at."""
 
@@ -127,27 +137,25 @@ class BidirectionalPatchTracker:
             return TrackingResult(guess, True, 1.0)
         if not can_be_aligned:
             return TrackingResult(guess, False, 0.0, "too few events, and no depth to align instead")
-        result, overlap = self._track(current, guess, trajectory)
+        best = self._track(current, guess, trajectory)
         if can_be_reference:
-            if overlap < self._config.min_overlap or not result.converged:
+            if best.overlap < self._config.min_overlap or not best.result.converged:
                 self._keyframe = current
             self._previous = current
-        return result
+        return best.result
 
     def refer_to(self, frame: Frame) -> None:
         """Align the next frames to this one, whose pose is on the trajectory, and forget earlier ones."""
         self._surfaces.reset()
         self._keyframe = self._previous = self._with_patches(frame)
 
-    def _track(
-        self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory
-    ) -> tuple[TrackingResult, float]:
-        def attempt(start: np.ndarray) -> tuple[TrackingResult, float]:
+    def _track(self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory) -> Attempt:
+        def attempt(start: np.ndarray) -> Attempt:
             return self._judge(self._align(current, start, trajectory), predicted)
 
         return best_attempt(attempt, predicted, trajectory.pose(-1))
 
-    def _judge(self, alignment: _Alignment, predicted: np.ndarray) -> tuple[TrackingResult, float]:
+    def _judge(self, alignment: _Alignment, predicted: np.ndarray) -> Attempt:
         """Return the result and the overlap; a failed alignment falls back to the predicted pose."""
         system = alignment.system
         usable = max(system.num_usable, 1)
@@ -163,8 +171,8 @@ class BidirectionalPatchTracker:
         elif eigenvalues[0] <= eigenvalues[-1] / MAX_CONDITION:
             message = "motion not fully observed (ill-conditioned)"
         if message:
-            return TrackingResult(predicted, False, quality, message), overlap
-        return TrackingResult(alignment.T_world_camera, True, quality), overlap
+            return Attempt(TrackingResult(predicted, False, quality, message), False, overlap)
+        return Attempt(TrackingResult(alignment.T_world_camera, True, quality), True, overlap)
 
     def _align(self, current: _Reference, guess: np.ndarray, trajectory: Trajectory) -> _Alignment:
         T = guess
@@ -241,20 +249,16 @@ def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualMode
 
 
 def best_attempt(
-    attempt: Callable[[np.ndarray], tuple[TrackingResult, float]],  # from a start [4, 4]: result, overlap
+    attempt: Callable[[np.ndarray], Attempt],  # from a start [4, 4]
     predicted: np.ndarray,  # [4, 4] at constant velocity
     last: np.ndarray,  # [4, 4] as after a sudden stop
-) -> tuple[TrackingResult, float]:
-    """Return the attempt of better quality; the one from the last pose is made only if the first fails."""
-    best: tuple[TrackingResult, float] | None = None
-    for start in (predicted, last):
-        candidate = attempt(start)
-        if best is None or candidate[0].quality > best[0].quality:
-            best = candidate
-        if candidate[0].converged:
-            break
-    assert best is not None
-    return best
+) -> Attempt:
+    """Return the attempt of better quality; the one from the last pose is left out if the first is sure."""
+    first = attempt(predicted)
+    if first.is_sure:
+        return first
+    second = attempt(last)
+    return second if second.result.quality > first.result.quality else first
 
 
 def levenberg_marquardt(

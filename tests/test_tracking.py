@@ -9,7 +9,7 @@ from sequences import ate_cm, position_errors, settings, tracked, without_depth,
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import TruePoses
+from edslam_ti.tracking import Attempt, TrackingResult, TruePoses, best_attempt
 from edslam_ti.trajectory import Trajectory
 from kernels.patch_warp import Alignment, NormalEquations
 
@@ -176,3 +176,22 @@ def test_true_poses_are_the_truth_and_lost_where_there_is_none(
     )
     assert not result.converged
     assert (result.T_world_camera == guess).all()
+
+
+def test_a_doubtful_attempt_is_followed_by_one_from_the_last_pose_and_the_better_counts() -> None:
+    predicted, last = np.eye(4), 2 * np.eye(4)
+    starts: list[float] = []
+
+    def best(is_sure: bool, quality_from_last: float) -> float:
+        def attempt(start: np.ndarray) -> Attempt:
+            starts.append(start[0, 0])
+            is_last = start is last
+            quality = quality_from_last if is_last else 0.5
+            return Attempt(TrackingResult(start, True, quality), is_sure, overlap=1.0)
+
+        starts.clear()
+        return float(best_attempt(attempt, predicted, last).result.T_world_camera[0, 0])
+
+    assert (best(True, 0.9), starts) == (1.0, [1.0])
+    assert (best(False, 0.9), starts) == (2.0, [1.0, 2.0])
+    assert (best(False, 0.1), starts) == (1.0, [1.0, 2.0])
