@@ -60,7 +60,7 @@ class BrightnessTracker:
         self._config = config
         self._aligner = KeyframeAligner(camera, config, seed)
         self._surface_tracker = BidirectionalPatchTracker(camera, surface_config, config, seed)
-        self._change = BrightnessChange(camera.shape, *(contrast.value * c for c in contrast.relative))
+        self._change = BrightnessChange(camera.shape, *contrast.by_polarity)
         self._stretch_start = 0  # first frame of the stretch of uninterrupted events
         self._moments: list[Moment] = []  # the last frames of the stretch
         self._keyframe: BrightnessKeyframe | None = None  # None: no image yet
@@ -179,7 +179,7 @@ class BrightnessTracker:
     # --- frame by frame ---
 
     def _follow(self, moment: Moment, guess: np.ndarray) -> Attempt:
-        """Return the frame's pose and the share of the keyframe in view."""
+        """Return the better alignment: from the predicted pose and, where that is in doubt, from the last."""
 
         def attempt(start: np.ndarray) -> Attempt:
             aligned = self._align(moment, moment.depth, start)

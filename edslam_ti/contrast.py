@@ -53,6 +53,12 @@ class ContrastThreshold:
             return 1.0, 1.0
         return self.positive / self.value, self.negative / self.value
 
+    @property
+    def by_polarity(self) -> tuple[float, float]:
+        """Return the positive and the negative threshold; `value` both unless they differ."""
+        positive, negative = self.relative
+        return self.value * positive, self.value * negative
+
 
 def contrast_threshold(
     stated: float | None,  # by the settings

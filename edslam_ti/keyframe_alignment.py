@@ -17,7 +17,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.frame import Frame, downscaled, downscaled_depth
 from edslam_ti.geometry import exp_matrix, orthonormalized, rigid_inverse
-from edslam_ti.tracking import MAX_CONDITION, MIN_PIXELS, levenberg_marquardt, residual_model
+from edslam_ti.tracking import MIN_PIXELS, is_observed, levenberg_marquardt, residual_model
 from kernels import depth_average
 from kernels.depth_average import DepthAgreement, PixelRays, average_depth
 from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches, ResidualModel
@@ -92,12 +92,11 @@ class Aligned:
 
     def problem(self, min_overlap: float) -> str:
         """Return why the pose cannot be trusted, or nothing."""
-        eigenvalues = np.linalg.eigvalsh(self.system.H)
         if self.system.num_surface < MIN_PIXELS:
             return f"only {self.system.num_surface} pixels of the keyframe in view"
         if self.overlap < min_overlap:
             return f"only {self.overlap:.0%} of the keyframe in view"
-        if eigenvalues[0] <= eigenvalues[-1] / MAX_CONDITION:
+        if not is_observed(self.system):
             return "motion not fully observed (ill-conditioned)"
         if self.misfit > MAX_MISFIT:
             return f"brightness differs by {self.misfit:.2f} (median, log)"
@@ -210,15 +209,13 @@ class KeyframeAligner:
         steps = COARSE_STEPS if depth is not None else 2 * COARSE_STEPS
         T = start
         for level, view in ((1, [downscaled(image), downscaled_depth(small)]), (0, [image, small])):
-            linearise = self._linearised(keyframe.points[level], self._model, view, self._cameras[level])
+            linearise = linearised(keyframe.points[level], self._model, view, self._cameras[level])
             T, system = levenberg_marquardt(linearise, T, steps, SMALL_GAIN)
         if depth is not None and keyframe.depth_points is not None and self._model.depth_weight > 0:
             # Reduced depth is blurred at edges: the last step uses it as it was measured.
             nothing = np.zeros_like(depth.full)
-            brightness = self._linearised(
-                keyframe.points[0], self._brightness_only, [image, small], self.camera
-            )
-            geometry = self._linearised(
+            brightness = linearised(keyframe.points[0], self._brightness_only, [image, small], self.camera)
+            geometry = linearised(
                 keyframe.depth_points, self._depth_only, [nothing, depth.full], self._camera
             )
             both = brightness(T) + geometry(T)
@@ -235,26 +232,9 @@ class KeyframeAligner:
         T = start
         for level, image in ((1, downscaled_depth(depth.small)), (0, depth.small)):
             view = [np.zeros_like(image), image]
-            linearise = self._linearised(keyframe.points[level], self._depth_only, view, self._cameras[level])
+            linearise = linearised(keyframe.points[level], self._depth_only, view, self._cameras[level])
             T, system = levenberg_marquardt(linearise, T, COARSE_STEPS)
         return orthonormalized(T), system
-
-    def _linearised(
-        self,
-        points: Tensor,  # of the keyframe
-        model: ResidualModel,
-        view: list[np.ndarray],  # log brightness and depth
-        camera: Camera,  # of the view
-    ) -> Callable[[np.ndarray], NormalEquations]:
-        """Return the normal equations of alignment to a keyframe as a function of T_keyframe_camera."""
-        alignment = Alignment([Direction(points, 0, model)], cv2.merge(view)[None], camera.intrinsics)
-
-        def linearise(T_keyframe_camera: np.ndarray) -> NormalEquations:
-            # T exp(xi) moves T_camera_keyframe to exp(-xi) T_camera_keyframe
-            (system,) = alignment.linearise([rigid_inverse(T_keyframe_camera)])
-            return system.transformed(-np.eye(6))
-
-        return linearise
 
     # --- what is in view ---
 
@@ -288,3 +268,20 @@ class KeyframeAligner:
         front = z > 0.05
         x, y, z, u, v = (a[front] for a in (x, y, z, u, v))
         return fx * x / z + cx, fy * y / z + cy, u, v
+
+
+def linearised(
+    points: Tensor,  # of the reference
+    model: ResidualModel,
+    view: list[np.ndarray],  # [h, w] log brightness and depth (metres, 0 = missing)
+    camera: Camera,  # of the view
+) -> Callable[[np.ndarray], NormalEquations]:
+    """Return the normal equations of a view's alignment as a function of T_reference_camera."""
+    alignment = Alignment([Direction(points, 0, model)], cv2.merge(view)[None], camera.intrinsics)
+
+    def linearise(T_reference_camera: np.ndarray) -> NormalEquations:
+        # T exp(xi) moves T_camera_reference to exp(-xi) T_camera_reference
+        (system,) = alignment.linearise([rigid_inverse(T_reference_camera)])
+        return system.transformed(-np.eye(6))
+
+    return linearise

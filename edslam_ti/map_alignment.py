@@ -7,14 +7,14 @@ than either. Where a frame has depth, the tracker is the better of the two.
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
-from edslam_ti.geometry import exp_matrix, is_near, log_vector, rigid_inverse
-from edslam_ti.tracking import MAX_CONDITION, MIN_PIXELS, levenberg_marquardt, residual_model
-from kernels.patch_warp import Alignment, Direction, NormalEquations, Patches
+from edslam_ti.geometry import exp_matrix, is_near, log_vector
+from edslam_ti.keyframe_alignment import linearised
+from edslam_ti.tracking import MIN_PIXELS, is_observed, levenberg_marquardt, residual_model
+from kernels.patch_warp import Patches
 
 OPAQUE = 0.9  # alpha from which a pixel of the map's view is a surface
 SPACING = 2  # pixels between those that are aligned, in either direction
@@ -45,17 +45,8 @@ class MapAligner:
         image = image - np.median(image[v, u] - view[v, u])  # their levels may differ
         pixels = np.stack([u, v, 1 / depth[v, u]], -1).astype(np.float32)
         points = Patches(pixels, view[v, u]).points(self._camera.intrinsics)
-        nothing = np.zeros(image.shape, np.float32)  # no depth
-        images = cv2.merge([image.astype(np.float32), nothing])[None]
-        alignment = Alignment([Direction(points, 0, self._model)], images, self._camera.intrinsics)
-
-        def linearise(T_view_camera: np.ndarray) -> NormalEquations:
-            # T exp(xi) moves T_camera_view to exp(-xi) T_camera_view
-            (system,) = alignment.linearise([rigid_inverse(T_view_camera)])
-            return system.transformed(-np.eye(6))
-
+        no_depth = np.zeros(image.shape, np.float32)
+        linearise = linearised(points, self._model, [image.astype(np.float32), no_depth], self._camera)
         T_view_camera, system = levenberg_marquardt(linearise, np.eye(4), STEPS)
-        eigenvalues = np.linalg.eigvalsh(system.H)
-        is_observed = eigenvalues[0] > eigenvalues[-1] / MAX_CONDITION
-        is_good = is_observed and is_near(T_view_camera, *FARTHEST)
+        is_good = is_observed(system) and is_near(T_view_camera, *FARTHEST)
         return T_world_camera @ exp_matrix(SHARE * log_vector(T_view_camera)) if is_good else T_world_camera

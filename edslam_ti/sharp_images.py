@@ -53,7 +53,7 @@ class SharpImages:
                 "add the images or leave out --mapping.frames"
             )
         self._sequence = sequence
-        self._steps = np.array(contrast.relative) * contrast.value  # log brightness of an event, + and -
+        self._steps = contrast.by_polarity  # log brightness of an event, + and -
         self._exposure = config.exposure if config.exposure is not None else sequence.exposure or 0.0
         self._epsilon = np.float32(config.log_epsilon)
 

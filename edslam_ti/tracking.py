@@ -162,13 +162,12 @@ class BidirectionalPatchTracker:
         overlap = system.num_surface / usable
         quality = max(0.0, 1.0 - system.cost / (system.num_surface * (1 + self._model.depth_weight) + 1) / 4)
         quality *= min(1.0, overlap)
-        eigenvalues = np.linalg.eigvalsh(system.H)
         message = ""
         if system.num_surface < MIN_PIXELS:
             message = f"only {system.num_surface} patch pixels visible"
         elif overlap < self._config.min_inliers:
             message = f"only {overlap:.0%} of patch pixels agree in depth"
-        elif eigenvalues[0] <= eigenvalues[-1] / MAX_CONDITION:
+        elif not is_observed(system):
             message = "motion not fully observed (ill-conditioned)"
         if message:
             return Attempt(TrackingResult(predicted, False, quality, message), False, overlap)
@@ -246,6 +245,12 @@ def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualMode
         depth_sigma_2=config.depth_sigma_2,
         huber_threshold=config.huber_threshold,
     )
+
+
+def is_observed(system: NormalEquations) -> bool:
+    """Return whether all six motions show in what is aligned (well-conditioned normal equations)."""
+    eigenvalues = np.linalg.eigvalsh(system.H)
+    return bool(eigenvalues[0] > eigenvalues[-1] / MAX_CONDITION)
 
 
 def best_attempt(

@@ -76,7 +76,7 @@ LIBRARIES: dict[str, list[str]] = {
     "cv2": [
         *("edslam_ti.datasets.*", "edslam_ti.simulation.*", "edslam_ti.surface_frame", "edslam_ti.pictures"),
         *("edslam_ti.brightness", "edslam_ti.contrast", "edslam_ti.event_images"),
-        *("edslam_ti.keyframe_alignment", "edslam_ti.map_alignment", "edslam_ti.place_recognition"),
+        *("edslam_ti.keyframe_alignment", "edslam_ti.place_recognition"),
         "edslam_ti.pointcloud",
     ],
     "OpenEXR": ["edslam_ti.datasets.*"],
