@@ -19,6 +19,7 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.events import Events
 from kernels import brightness_image, time_surface
+from kernels.runtime import check_shape
 
 HYSTERESIS = 0.5  # thresholds
 HUBER = 0.1  # log brightness; equations beyond count less (occlusions, reflections, wrong depth)
@@ -77,18 +78,14 @@ def solve_log_brightness_image(
 
     `is_robust`: equations that the prior fits badly count less (Huber).
     """
-    return brightness_image.solve_brightness_image(
-        depth,
-        camera.intrinsics,
-        [o.T_camera_keyframe for o in observations],
-        [o.change for o in observations],
-        [o.depth for o in observations],
-        prior,
-        prior_weight,
-        HUBER,
-        iterations,
-        is_robust,
+    check_shape("prior", prior, depth.shape)
+    own = brightness_image.ChangeImage(np.zeros(depth.shape, np.float32), depth)
+    images = [own, *(brightness_image.ChangeImage(o.change, o.depth) for o in observations)]
+    pairs = [brightness_image.Pair(0, k, o.T_camera_keyframe) for k, o in enumerate(observations, 1)]
+    image, _ = brightness_image.solve_brightness_image(
+        images, pairs, camera.intrinsics, prior, prior_weight, HUBER, iterations, [is_robust]
     )
+    return image
 
 
 def compile_kernels() -> None:

@@ -161,6 +161,7 @@ class GaussianMapper:
         self._refiner = PoseRefiner(config.mapping.poses_rate)
         self._aligner = MapAligner(camera, config.tracking)
         self._num_frames = 0
+        self._num_supervised = 0  # frames that the map has been optimised for, forgotten ones too
         self.budget = Budget(config.mapping.budget)
         self.num_steps = 0  # taken so far
 
@@ -189,7 +190,8 @@ class GaussianMapper:
             self._take_in_depth(frame, index, trajectory)
         if frame.is_held_out or len(self.gaussians) == 0:
             return
-        count = len(self.images.frames)
+        self._num_supervised += 1
+        count = self._num_supervised
         if count % SOLVE_EVERY == 0 or (count < SOLVE_EVERY and not self.images.is_solved):
             self._solve_brightness(trajectory)
         if self.images.is_solved:

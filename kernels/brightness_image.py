@@ -1,19 +1,22 @@
 """The image from which the observed changes of brightness follow: robust least squares, matrix-free.
 
-Pixel u of a keyframe, seen at x_k(u) at time k, gives the equation l(u) - l(x_k(u)) = E_k(x_k(u)) in the
-log brightness l; A l = b are all of them, and the image minimises
+With E_k the change of log brightness measured from the image l until time k, the image at k is l + E_k.
+What is at pixel u at time j and at x(u) at time k has one brightness, which gives the equation
+l(u) - l(x(u)) = E_k(x(u)) - E_j(u), without l where the image at j or k is known. A l = b are all of them,
+and the image minimises
 
     sum of rho((A l - b)_i) + lambda |l - prior|^2,    rho: Huber's function
 
 by conjugate gradients on the normal equations A^T W A + lambda, preconditioned by their diagonal. The
 prior's residuals give the weights W: solving again from a solution reweights. A row of A is 1 at u and
-minus four bilinear weights at the corners around x_k(u): read and written as one vector, from and to an
+minus four bilinear weights at the corners around x(u): read and written as one vector, from and to an
 image of four-vectors. One worker takes the rows in their order, so that sums are the same for any number
 of workers.
 """
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
@@ -24,8 +27,11 @@ from kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
 NEAR = 0.05  # metres
 OCCLUSION, OCCLUSION_MARGIN = 0.03, 0.02  # share of depth, metres: this far behind what is measured is hidden
+SAME_SURFACE = 0.03  # share of depth: within it is the surface that is measured
 BORDER = 1.001  # pixels; all four corners are in the image
 CONVERGED = 1e-14  # of the squared residual, preconditioned, at the start
+NO_DEPTH = -1.0  # of all pixels of an image without depth, where any surface counts as seen
+KEPT_ROWS = 1 << 20  # the memory of smaller systems is kept: fresh costs as much as what is computed in it
 
 _Corners = ti.types.vector(
     4
@@ -40,16 +46,18 @@ def corners(ndim: int) -> ti.types.ndarray:
 @ti.kernel
 def _find_rows(
     # inputs
-    depth: ti.types.ndarray(ndim=1),  # [H W] metres, 0 = missing
+    pairs: ti.types.ndarray(ti.i32, ndim=2),  # [K, 2] images where u and x(u) are
     projections: ti.types.ndarray(ndim=2),  # [K, 12] rows of [C R C^-1 | C t], C the camera matrix
-    changes: ti.types.ndarray(ndim=1),  # [K H W]
-    depths: ti.types.ndarray(ndim=1),  # [K H W] metres, 0 = missing
+    changes: ti.types.ndarray(ndim=1),  # [V H W]
+    depths: ti.types.ndarray(ndim=1),  # [V H W] metres, 0 = missing
+    is_known: ti.types.ndarray(ti.u8, ndim=1),  # [V] the change is all there is
     height: ti.i32,
     width: ti.i32,
+    is_strict: ti.i32,
     num_workers: ti.i32,
-    # outputs, an observation's rows from k H W on
-    count: ti.types.ndarray(ti.i32, ndim=1),  # [K] rows of an observation
-    place: ti.types.ndarray(ti.i64, ndim=1),  # [K H W] pixel u + 2^32 times the one right below x_k(u)
+    # outputs, a pair's rows from k H W on
+    count: ti.types.ndarray(ti.i32, ndim=1),  # [K] rows of a pair
+    place: ti.types.ndarray(ti.i64, ndim=1),  # [K H W] pixel u + 2^32 times the one right below x(u)
     bilinear: ti.types.ndarray(ndim=2),  # [K H W, 4]
     change: ti.types.ndarray(ndim=1),  # [K H W] b
 ):
@@ -59,13 +67,14 @@ def _find_rows(
             right_end, lower_end = float(width) - BORDER, float(height) - BORDER
             for k in range(K * worker // num_workers, K * (worker + 1) // num_workers):
                 P = [projections[k, i] for i in range(12)]
-                first = k * height * width
-                row = first
+                n = height * width
+                row, source, target = k * n, pairs[k, 0] * n, pairs[k, 1] * n
+                known, share = is_known[pairs[k, 0]] > 0, ti.select(is_known[pairs[k, 1]] > 0, 0.0, 1.0)
                 for v in range(height):
                     left_x, left_y, left_z = P[1] * v + P[2], P[5] * v + P[6], P[9] * v + P[10]
                     for u in range(width):
                         own = v * width + u
-                        Z = depth[own]
+                        Z = depths[source + own]
                         z = (P[8] * u + left_z) * Z + P[11]
                         inv_z = 1.0 / ti.max(z, NEAR)
                         x = ((P[0] * u + left_x) * Z + P[3]) * inv_z
@@ -76,21 +85,26 @@ def _find_rows(
                             right, down = x - j, y - i
                             left, up = 1.0 - right, 1.0 - down
                             weights = [left * up, right * up, left * down, right * down]
-                            corner = first + i * width + j
+                            corner = target + i * width + j
                             corners_ = [corner, corner + 1, corner + width, corner + width + 1]
                             nearest, seen = 1e30, 0.0
                             for c in ti.static(range(4)):
                                 measured = depths[corners_[c]]
                                 nearest = ti.select((measured > 0) & (measured < nearest), measured, nearest)
                                 seen += weights[c] * changes[corners_[c]]
-                            if z <= nearest * (1 + OCCLUSION) + OCCLUSION_MARGIN:
-                                below = i * width + j + width + 1
-                                place[row] = ti.cast(below, ti.i64) << 32 | own
-                                change[row] = seen
+                            is_seen = z <= nearest * (1 + OCCLUSION) + OCCLUSION_MARGIN
+                            if is_strict > 0:
                                 for c in ti.static(range(4)):
-                                    bilinear[row, c] = weights[c]
+                                    measured = depths[corners_[c]]
+                                    is_seen &= (measured < 0) | (ti.abs(measured - z) < SAME_SURFACE * z)
+                            if is_seen:
+                                below = i * width + j + width + 1
+                                place[row] = ti.cast(below, ti.i64) << 32 | ti.select(known, n, own)
+                                change[row] = seen - changes[source + own]
+                                for c in ti.static(range(4)):
+                                    bilinear[row, c] = share * weights[c]
                                 row += 1
-                count[k] = row - first
+                count[k] = row - k * n
 
 
 @ti.func
@@ -136,7 +150,7 @@ def _solve(
     iterations: ti.i32,
     is_robust: ti.i32,
     # in and out
-    level: ti.types.ndarray(ndim=1),  # [N] N >= H W
+    level: ti.types.ndarray(ndim=1),  # [N] N > H W; what is known stands at H W, as 0
     level_lanes: lanes(1),  # the same memory
     # scratch
     weight: ti.types.ndarray(ndim=1),  # [K H W] robust
@@ -174,6 +188,7 @@ def _solve(
                 diagonal[u] = diagonal[u] + robust
                 sums[c] = sums[c] + (robust * error) * w
                 squares[c] = squares[c] + robust * w * w
+        residual[n] = 0.0
         for u in range(n):
             residual[u] = residual[u] - folded(sums, u, width)
             diagonal[u] = 1.0 / (diagonal[u] + folded(squares, u, width))
@@ -197,6 +212,7 @@ def _solve(
                         value = weight[row] * (direction[u] - (w * around[c]).sum())
                         image[u] = image[u] + value
                         sums[c] = sums[c] + value * w
+                image[n] = 0.0
                 for u in range(n):
                     image[u] = image[u] - folded(sums, u, width)
                 step = rho / dot(direction_lanes, image_lanes, num_lanes)
@@ -214,71 +230,105 @@ def _solve(
                     )
 
 
-class _Memory:
-    """Arrays for up to K observations, kept: a fresh one costs as much as what is computed in it."""
+class ChangeImage(NamedTuple):
+    """What has been measured at one time."""
 
-    def __init__(self, K: int, n: int, width: int, dtype: torch.dtype) -> None:
+    change: np.ndarray  # [H, W] log brightness less the image that is looked for
+    depth: np.ndarray | None  # [H, W] metres, 0 = missing
+    is_known: bool = False  # the change is all the log brightness there is
+
+
+class Pair(NamedTuple):
+    """Two images: every pixel with depth of the first gives an equation where it is seen in the second."""
+
+    first: int  # index of an image
+    second: int
+    T_second_first: np.ndarray  # [4, 4]
+
+
+class _Memory:
+    """Arrays for up to K pairs of V images."""
+
+    def __init__(self, K: int, V: int, n: int, width: int, dtype: torch.dtype) -> None:
         numpy_dtype = np.float64 if dtype == torch.float64 else np.float32
-        self.changes, self.depths = np.empty((2, K, n), numpy_dtype)
+        self.changes, self.depths = np.empty((2, V, n), numpy_dtype)
         self.place = np.empty(K * n, np.int64)
         self.bilinear = torch.empty(K * n, 4, dtype=dtype)
         self.change, self.weight = np.empty((2, K * n), numpy_dtype)
-        self.vectors = torch.empty(6, -(-n // LANES) * LANES, dtype=dtype)
+        self.vectors = torch.empty(6, (n // LANES + 1) * LANES, dtype=dtype)
         self.around = torch.empty(3, n + width + 1, 4, dtype=dtype)
 
 
-_memory = functools.lru_cache(maxsize=2)(_Memory)
+_kept_memory = functools.lru_cache(maxsize=2)(_Memory)
 
 
 def solve_brightness_image(
-    depth: np.ndarray,  # [H, W] of the keyframe, metres, 0 = missing
+    images: Sequence[ChangeImage],  # V of them
+    pairs: Sequence[Pair],  # K of them
     intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy, pixels
-    poses: Sequence[np.ndarray],  # K times [4, 4] T_camera_keyframe
-    changes: Sequence[np.ndarray],  # K times [H, W] log brightness since the keyframe
-    depths: Sequence[np.ndarray | None],  # K times [H, W] metres, 0 = missing; hidden points are left out
     prior: np.ndarray,  # [H, W] log brightness; stays where nothing was observed
     prior_weight: float,  # lambda
     huber: float,  # log brightness
     iterations: int,  # of conjugate gradients
-    is_robust: bool,  # equations that the prior fits badly count less, else all alike
-) -> np.ndarray:  # [H, W]
-    """Return the keyframe's log brightness; one solution at a time, they share their memory."""
-    check_shape("prior", prior, depth.shape)
+    is_robust: Sequence[bool],  # solutions, each from the one before, the first from the prior
+    is_strict: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:  # [H, W], [H, W] bool
+    """Return the log brightness, and which of its pixels stand in an equation.
+
+    Robust solutions: equations that the solution before fits badly count less, else all alike. Hidden points
+    are left out; with `is_strict` also those where the depth of the second image is missing or another one.
+    One solution at a time: they share their memory.
+    """
     if prior_weight <= 0:
         raise ValueError(f"prior_weight: expected a positive weight, got {prior_weight}")
-    K, (height, width), n = len(changes), depth.shape, depth.size
-    memory = _memory(max(8, 1 << (K - 1).bit_length()), n, width, float_dtype())
+    for k, image in enumerate(images):
+        check_shape(f"images[{k}].change", image.change, prior.shape)
+        if image.depth is not None:
+            check_shape(f"images[{k}].depth", image.depth, prior.shape)
+    with_depth = [p for p in pairs if images[p.first].depth is not None]
+    if not with_depth:
+        return prior.copy(), np.zeros(prior.shape, bool)
+    K, V, (height, width), n = len(with_depth), len(images), prior.shape, prior.size
+    room = max(8, 1 << (K - 1).bit_length())
+    make = _kept_memory if room * n <= KEPT_ROWS else _Memory
+    memory = make(room, max(8, 1 << (V - 1).bit_length()), n, width, float_dtype())
+    for k, image in enumerate(images):
+        memory.changes[k] = image.change.reshape(-1)
+        memory.depths[k] = NO_DEPTH if image.depth is None else image.depth.reshape(-1)
+    dtype = memory.changes.dtype
+    count = np.empty(K, np.int32)
+    _find_rows(
+        np.array([(p.first, p.second) for p in with_depth], np.int32),
+        _projections([p.T_second_first for p in with_depth], intrinsics).astype(dtype),
+        memory.changes.reshape(-1), memory.depths.reshape(-1),
+        np.array([i.is_known for i in images], np.uint8), height, width, int(is_strict), min(workers(), K),
+        count, memory.place, memory.bilinear.numpy(), memory.change,
+    )  # fmt: skip
     start, level, *others = memory.vectors
     memory.vectors.numpy()[:] = 0
     level.numpy()[:n] = start.numpy()[:n] = prior.reshape(-1)
-    if K == 0:
-        return level.numpy()[:n].reshape(height, width).copy()
-    for k, (changed, seen) in enumerate(zip(changes, depths, strict=True)):
-        check_shape("changes", changed, depth.shape)
-        memory.changes[k] = changed.reshape(-1)
-        memory.depths[k] = 0 if seen is None else seen.reshape(-1)
+    for robust in is_robust:
+        _solve(
+            width, count, memory.place, memory.bilinear, memory.change, start.view(-1, LANES),
+            prior_weight, huber, iterations, int(robust), level, level.view(-1, LANES),
+            memory.weight, *memory.around, *(a for o in others for a in (o, o.view(-1, LANES))),
+        )  # fmt: skip
+    inverse_diagonal = others[0].numpy()[:n]
+    is_observed = inverse_diagonal < (1 - 1e-3) / prior_weight
+    return level.numpy()[:n].reshape(height, width).copy(), is_observed.reshape(height, width)
+
+
+def _projections(poses: Sequence[np.ndarray], intrinsics: tuple[float, float, float, float]) -> np.ndarray:
+    """Return the rows of [C R C^-1 | C t] as [K, 12], C the camera matrix."""
     fx, fy, cx, cy = intrinsics
     C = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     projections = C @ np.array(poses, np.float64)[:, :3]
     projections[:, :, :3] = projections[:, :, :3] @ np.linalg.inv(C)
-    dtype = memory.changes.dtype
-    count = np.empty(K, np.int32)
-    _find_rows(
-        np.ascontiguousarray(depth, dtype).reshape(-1), projections.reshape(K, 12).astype(dtype),
-        memory.changes.reshape(-1), memory.depths.reshape(-1), height, width, min(workers(), K),
-        count, memory.place, memory.bilinear.numpy(), memory.change,
-    )  # fmt: skip
-    _solve(
-        width, count, memory.place, memory.bilinear, memory.change, start.view(-1, LANES),
-        prior_weight, huber, iterations, int(is_robust), level, level.view(-1, LANES),
-        memory.weight, *memory.around, *(a for o in others for a in (o, o.view(-1, LANES))),
-    )  # fmt: skip
-    return level.numpy()[:n].reshape(height, width).copy()
+    return projections.reshape(-1, 12)
 
 
 def compile_kernels() -> None:
     """Compile what a solution needs, so that the first frames of a sequence need not wait for it."""
-    image = np.ones((3, 3), np.float32)
-    solve_brightness_image(
-        image, (1.0, 1.0, 0.0, 0.0), [np.eye(4)], [image], [image], image, 1.0, 1.0, 1, False
-    )
+    image = ChangeImage(np.ones((3, 3), np.float32), np.ones((3, 3), np.float32))
+    pair = Pair(0, 0, np.eye(4))
+    solve_brightness_image([image], [pair], (1.0, 1.0, 0.0, 0.0), image.change, 1.0, 1.0, 1, [False])

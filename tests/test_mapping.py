@@ -12,6 +12,7 @@ from sequences import make_slam, settings
 
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.evaluation import depth_l1_cm, evaluate_images
+from edslam_ti.event_images import EventImages
 from edslam_ti.geometry import exp_matrix
 from edslam_ti.mapping import GaussianMapper, PoseRefiner, densify_mask, spaced, stride_in_room
 from edslam_ti.pointcloud import beside_steps
@@ -230,6 +231,24 @@ def test_map_follows_when_a_revisit_corrects_the_path(
     monkeypatch.setattr(GaussianMapper, "_follow", lambda self, trajectory: None)
     staying = depth_error()
     assert following - clean < 0.5 * (staying - clean)
+
+
+def test_start_image_is_solved_as_often_when_frames_are_forgotten(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edslam_ti.mapping.SOLVE_EVERY", 3)
+    slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW | {"max_views": 10}))
+    assert isinstance(slam.mapper, GaussianMapper)
+    images, solved_at = slam.mapper.images, []
+
+    def solve(*given: Any) -> bool:
+        solved_at.append(len(slam.trajectory))
+        return EventImages.solve(images, *given)
+
+    monkeypatch.setattr(images, "solve", solve)
+    for sample in tiny_samples[:12]:
+        slam.process(sample, is_held_out=False)
+    assert solved_at[-3:] == [6, 9, 12]
 
 
 def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
