@@ -21,6 +21,7 @@ from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.keyframes import Keyframe, is_keyframe
 from edslam_ti.losses import scale_loss, view_loss
 from edslam_ti.map_alignment import MapAligner
+from edslam_ti.memory import release_free_memory
 from edslam_ti.pointcloud import beside_steps, depth_to_points, surface_discs, with_holes_filled
 from edslam_ti.rendering import RenderOutput, View, drawable, render, render_view
 from edslam_ti.sharp_images import SharpImages
@@ -173,6 +174,7 @@ class GaussianMapper:
         """Add the frame's events and Gaussians, then optimise over the window."""
         self.budget.start(frame.timestamp)
         self._update(frame, trajectory)
+        release_free_memory()
         self.budget.stop()
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:

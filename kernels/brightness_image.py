@@ -31,7 +31,7 @@ SAME_SURFACE = 0.03  # share of depth: within it is the surface that is measured
 BORDER = 1.001  # pixels; all four corners are in the image
 CONVERGED = 1e-14  # of the squared residual, preconditioned, at the start
 NO_DEPTH = -1.0  # of all pixels of an image without depth, where any surface counts as seen
-KEPT_ROWS = 1 << 20  # the memory of smaller systems is kept: fresh costs as much as what is computed in it
+KEPT_PAIRS = 32  # the memory for so many at most is kept: fresh costs as much as what is computed in it
 
 _Corners = ti.types.vector(
     4
@@ -290,7 +290,7 @@ def solve_brightness_image(
         return prior.copy(), np.zeros(prior.shape, bool)
     K, V, (height, width), n = len(with_depth), len(images), prior.shape, prior.size
     room = max(8, 1 << (K - 1).bit_length())
-    make = _kept_memory if room * n <= KEPT_ROWS else _Memory
+    make = _kept_memory if room <= KEPT_PAIRS else _Memory
     memory = make(room, max(8, 1 << (V - 1).bit_length()), n, width, float_dtype())
     for k, image in enumerate(images):
         memory.changes[k] = image.change.reshape(-1)

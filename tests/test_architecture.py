@@ -10,7 +10,14 @@ ROOT = Path(__file__).parents[1]
 
 # One row per rank: modules in the order of the data flow, "package.*" for all of a package.
 RANKS: list[list[str]] = [
-    ["kernels.*", "edslam_ti", "edslam_ti.errors", "edslam_ti.output", "edslam_ti.open3d_loader"],
+    [
+        "kernels.*",
+        "edslam_ti",
+        "edslam_ti.errors",
+        "edslam_ti.memory",
+        "edslam_ti.output",
+        "edslam_ti.open3d_loader",
+    ],
     ["edslam_ti.config", "edslam_ti.geometry", "edslam_ti.camera", "edslam_ti.events"],
     ["edslam_ti.trajectory", "edslam_ti.simulation.*", "edslam_ti.datasets.*"],
     [
