@@ -184,8 +184,15 @@ def _solve(
                 size = ti.select(error < 0, 0.0 - error, error)
                 robust = ti.select((is_robust > 0) & (size > huber), huber / size, 1.0)
                 weight[row] = robust
+                # One of the corners may be u itself: the square is that of 1 - its weight.
+                twice = (
+                    w[0] * (c - width - 1 == u)
+                    + w[1] * (c - width == u)
+                    + w[2] * (c - 1 == u)
+                    + w[3] * (c == u)
+                )
                 residual[u] = residual[u] + robust * error
-                diagonal[u] = diagonal[u] + robust
+                diagonal[u] = diagonal[u] + robust * (1 - 2 * twice)
                 sums[c] = sums[c] + (robust * error) * w
                 squares[c] = squares[c] + robust * w * w
         residual[n] = 0.0
