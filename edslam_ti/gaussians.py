@@ -81,11 +81,14 @@ class GaussianMap:
         """Raw parameters by name."""
         return self._raw
 
-    def activated(self) -> Gaussians:
+    def activated(self, chosen: Tensor | None = None) -> Gaussians:  # [M] indices; None: all
         """Return what is rendered, differentiable in the raw parameters; compute it once a step."""
-        raw = self._raw
         # index_select adds its gradients up in order; indexing does it in parallel, differently every run
-        shared = self._cell_table.index_select(0, self._cells.reshape(-1)).view_as(self._cells)
+        raw, cells = self._raw, self._cells
+        if chosen is not None:
+            raw = {name: value.index_select(0, chosen) for name, value in raw.items()}
+            cells = cells.index_select(0, chosen)
+        shared = self._cell_table.index_select(0, cells.reshape(-1)).view_as(cells)
         return Gaussians(
             raw["means"],
             raw["quats"],

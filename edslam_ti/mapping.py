@@ -34,7 +34,7 @@ ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted,
 ALIGN_FROM = 0.5  # fraction of them after which frames without depth are aligned to the map, once
 WHITE = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between solutions of the start image
-MAX_RECOLOURED = 24  # frames looked at for the brightness that such a solution gives Gaussians
+MAX_RECOLOURED = 8  # frames looked at for the brightness that such a solution gives Gaussians
 FINER = 2  # times closer are new Gaussians beside steps of depth
 FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
 MAX_STRETCH = 4.0  # of a new Gaussian on a surface that falls away
@@ -440,7 +440,7 @@ class GaussianMapper:
         """Return the map seen from a pose; what is out of view takes neither time nor memory."""
         T = torch.from_numpy(T_world_camera)
         chosen = drawable(self.gaussians, self._camera, T)
-        view = render(self.gaussians.part(chosen).activated(), self._camera, T, self._config.background)
+        view = render(self.gaussians.activated(chosen), self._camera, T, self._config.background)
         visible = torch.zeros(len(self.gaussians), dtype=torch.bool)
         visible[chosen] = view.visible
         # Indices of the part to those of the map; -1, the last one here, stays -1.

@@ -1,6 +1,5 @@
 """Views of a Gaussian map."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +9,11 @@ from torch import Tensor
 from edslam_ti.camera import Camera
 from edslam_ti.gaussians import GaussianMap, Gaussians
 from edslam_ti.geometry import inverse
-from kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA, NEAR
+from kernels import culling
+from kernels.projection import LOW_PASS
 from kernels.rasterization import rasterize
 
 MIN_DRAWN = 1e-3  # alpha; below this there is no depth to speak of
-REACH = math.sqrt(-2 * math.log(MIN_ALPHA))  # standard deviations to where an opaque Gaussian ends
 
 
 @dataclass(frozen=True)
@@ -74,24 +73,9 @@ def drawable(
     T_world_camera: Tensor,  # [4, 4]
 ) -> Tensor:  # [M] indices
     """Return the Gaussians that may show; the others lie behind the camera or end outside the image."""
-    T = inverse(T_world_camera.detach()).float()
-    x, y, z = (gaussians.raw["means"].detach() @ T[:3, :3].T + T[:3, 3]).unbind(-1)
-    u, v = camera.fx * x / z, camera.fy * y / z  # pixels from the principal point
-    width, height = camera.width, camera.height
-    is_near = (z > NEAR) & _is_within(u + camera.cx, width, MARGIN * width)
-    is_near &= _is_within(v + camera.cy, height, MARGIN * height)  # farther off, rendering culls them
-    near = torch.nonzero(is_near).squeeze(1)
-    u, v, z = u[near], v[near], z[near]
-    sigma = gaussians.raw["log_scales"].detach().index_select(0, near).amax(-1).exp()
-    # The variance in the image is at most that of a ball as large, Eq. 7.
-    reach_u = REACH * torch.sqrt((camera.fx**2 + u**2) * (sigma / z) ** 2 + LOW_PASS)
-    reach_v = REACH * torch.sqrt((camera.fy**2 + v**2) * (sigma / z) ** 2 + LOW_PASS)
-    reaches = _is_within(u + camera.cx, width, reach_u) & _is_within(v + camera.cy, height, reach_v)
-    return near[reaches]
-
-
-def _is_within(position: Tensor, size: int, margin: Tensor | float) -> Tensor:  # [N] pixels -> bool
-    return (position > -1 - margin) & (position < size + margin)
+    raw, T_camera_world = gaussians.raw, inverse(T_world_camera.detach())
+    size = camera.width, camera.height
+    return culling.drawable(raw["means"], raw["log_scales"], T_camera_world, camera.intrinsics, size)
 
 
 def reduced_low_pass(reduction: int) -> float:
