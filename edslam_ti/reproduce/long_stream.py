@@ -105,12 +105,12 @@ def _newly_counted(address: int, size: int, counted: set[int]) -> int:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Means over a few seconds of data; memory and the map at their end."""
+    """Means over a few seconds of data; the most memory, and the map at their end."""
 
     start: float  # seconds of data
     end: float
     cpu_s: float  # a frame
-    memory_mb: float
+    memory_mb: float  # the most after any frame: it falls whenever free memory goes back
     num_gaussians: int
     map_mb: float
     frames_mb: float
@@ -132,7 +132,7 @@ def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
             k * length,
             (k + 1) * length,
             float(np.mean([c.cpu_s for c in part])),
-            part[-1].memory_mb,
+            max(c.memory_mb for c in part),
             part[-1].num_gaussians,
             part[-1].map_mb,
             part[-1].frames_mb,
