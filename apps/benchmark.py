@@ -48,9 +48,9 @@ def benchmark(
     """
     import torch  # torch and Taichi take seconds to load
 
-    import kernels
-    from edslam_ti import benchmark as steps
-    from kernels import benchmark as timed
+    from edslam_ti import kernels
+    from edslam_ti.experiments import kernel_times as timed
+    from edslam_ti.experiments import steps
 
     try:
         kernels.init(device, threads=threads)

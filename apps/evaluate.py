@@ -31,7 +31,7 @@ def evaluate(
     """
     if (mesh is None) != (recording is None):
         raise UsageError("--mesh and --recording: expected both or neither; give the missing one")
-    from edslam_ti.evaluation import statistics, trajectory_errors
+    from edslam_ti.evaluation.images import statistics, trajectory_errors
     from edslam_ti.trajectory import read_tum
 
     errors = trajectory_errors(read_tum(estimate), read_tum(truth))
@@ -49,7 +49,7 @@ def evaluate(
     print(f"\nSim(3) scale {errors.scale:.6f}; ATE rmse {errors.ate_rmse_cm:.3f} cm")
     if mesh is not None and recording is not None:
         from edslam_ti.datasets.event_replica import EventReplicaSequence
-        from edslam_ti.surface_errors import mesh_errors, read_triangles
+        from edslam_ti.evaluation.meshes import mesh_errors, read_triangles
 
         surface = mesh_errors(read_triangles(mesh), EventReplicaSequence(recording), read_tum(estimate))
         print(

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 
 from edslam_ti.command_line import UsageError, launch, parse_arguments
-from edslam_ti.reproduce.command import COMMANDS
+from edslam_ti.experiments.command import COMMANDS
 
 
 def main(argv: Sequence[str] | None = None) -> None:

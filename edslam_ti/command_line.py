@@ -117,7 +117,7 @@ def _dataset_differences(choices: dict[str, Any], configs: Path | None) -> dict[
 
 
 def _method_differences(name: str) -> dict[str, Any]:
-    from edslam_ti.baselines import METHODS
+    from edslam_ti.methods import METHODS
 
     if name not in METHODS:
         close = difflib.get_close_matches(name, METHODS, n=1)

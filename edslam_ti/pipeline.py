@@ -11,19 +11,19 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-import kernels
-from edslam_ti.baselines import METHODS
+from edslam_ti import kernels
 from edslam_ti.config import Config
-from edslam_ti.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation import ate_rmse_cm
+from edslam_ti.evaluation.images import ate_rmse_cm
+from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
-from edslam_ti.mapping import Mapper
-from edslam_ti.results import Run, save
+from edslam_ti.mapping.mapper import Mapper
+from edslam_ti.methods import METHODS
+from edslam_ti.results.folder import Run, save
+from edslam_ti.results.plots import StubViewer, Viewer
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import Tracker, TruePoses
-from edslam_ti.visualization import StubViewer, Viewer
+from edslam_ti.tracking.tracker import Tracker, TruePoses
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from edslam_ti.datasets.base import Sample
 from edslam_ti.frame import FrameBuilder
-from edslam_ti.mapping import Mapper
-from edslam_ti.tracking import Tracker, TrackingResult
+from edslam_ti.mapping.mapper import Mapper
+from edslam_ti.tracking.tracker import Tracker, TrackingResult
 from edslam_ti.trajectory import Trajectory
 
 

@@ -7,7 +7,7 @@ import gc
 _was_enabled = gc.isenabled()
 gc.disable()
 try:
-    from kernels.runtime import init
+    from edslam_ti.kernels.runtime import init
 finally:
     gc.freeze()
     atexit.register(gc.unfreeze)  # Taichi saves compiled kernels when its objects are collected at the end

@@ -22,8 +22,8 @@ import numpy as np
 import taichi as ti
 import torch
 
-from kernels.lanes import LANES, lanes, vector_instructions, zeros
-from kernels.runtime import CHUNK, check_shape, float_dtype, workers
+from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
+from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
 NEAR = 0.05  # metres
 OCCLUSION, OCCLUSION_MARGIN = 0.03, 0.02  # share of depth, metres: this far behind what is measured is hidden

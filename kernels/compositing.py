@@ -1,13 +1,13 @@
 """What a tile's or a block's list of Gaussians draws (Eq. 8), and its gradients: functions of the kernels.
 
 `draw` and `draw_backward` take a block of pixels, as the lanes of vectors (kernels.rasterization), or a
-single pixel (kernels.pixels); the maths is in kernels.rasterization.
+single pixel (kernels.rasterization_gpu); the maths is in kernels.rasterization.
 """
 
 import taichi as ti
 
-from kernels.lanes import LANES, SUMS, exp, largest, sums_of
-from kernels.projection import (
+from edslam_ti.kernels.lanes import LANES, SUMS, exp, largest, sums_of
+from edslam_ti.kernels.projection import (
     BLOCK,
     COLUMNS,
     EXTENT,

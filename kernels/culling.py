@@ -6,8 +6,8 @@ import taichi as ti
 import torch
 from torch import Tensor
 
-from kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA, NEAR
-from kernels.runtime import check_shape, plain
+from edslam_ti.kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA, NEAR
+from edslam_ti.kernels.runtime import check_shape, plain
 
 REACH = math.sqrt(-2 * math.log(MIN_ALPHA))  # standard deviations to where an opaque Gaussian ends
 

@@ -7,9 +7,9 @@ import numpy as np
 import taichi as ti
 import torch
 
-from kernels.lanes import LANES, lanes, vector_instructions, zeros
-from kernels.patch_warp import Patches
-from kernels.runtime import check_shape
+from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
+from edslam_ti.kernels.patch_warp import Patches
+from edslam_ti.kernels.runtime import check_shape
 
 NEAR = 0.05  # metres
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from kernels.runtime import check_shape
+from edslam_ti.kernels.runtime import check_shape
 
 MIN_THRESHOLD = 0.01  # ESIM's lower bound of a noisy threshold
 NEVER = -(2**62)  # time of the last event of a pixel that has fired none

@@ -15,7 +15,7 @@ import numpy as np
 import taichi as ti
 import torch
 
-from kernels.runtime import float_dtype
+from edslam_ti.kernels.runtime import float_dtype
 
 LANES = 16
 SUMS = 8  # of lanes, made at once

@@ -27,8 +27,8 @@ import numpy as np
 import taichi as ti
 import torch
 
-from kernels.lanes import LANES, lanes, vector_instructions, zeros
-from kernels.runtime import CHUNK, check_shape, float_dtype, workers
+from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
+from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
 PART = 32  # blocks of LANES pixels to a partial sum: a fixed partition, the same bits for any threads
 PARTS_PER_WORKER = 24  # fewer are done before another core has woken up

@@ -21,8 +21,17 @@ import taichi as ti
 import torch
 from torch import Tensor
 
-from kernels.lanes import LANES, SUMS, join_columns, lanes, largest, split_columns, sums, vector_instructions
-from kernels.runtime import CHUNK, float_dtype, plain, workers
+from edslam_ti.kernels.lanes import (
+    LANES,
+    SUMS,
+    join_columns,
+    lanes,
+    largest,
+    split_columns,
+    sums,
+    vector_instructions,
+)
+from edslam_ti.kernels.runtime import CHUNK, float_dtype, plain, workers
 
 NEAR = 0.05  # metres; nearer Gaussians are culled
 LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
@@ -411,7 +420,7 @@ class Projection:
     """One map as several views see it; index v * padded + i is Gaussian i in view v."""
 
     count: int  # Gaussians
-    gaussians: Tensor  # [COLOR + C, G, LANES], or [COLOR + C, N] of kernels.pixels
+    gaussians: Tensor  # [COLOR + C, G, LANES], or [COLOR + C, N] of kernels.rasterization_gpu
     poses: Tensor  # [V, 4, 4]
     intrinsics: tuple[float, float, float, float]
     low_pass: float

@@ -9,7 +9,7 @@ a tile: it copies the records of the list to where they stay in its cache, and l
 state stays in registers while the block's list is walked, and a pixel that an ellipse does not reach, or that
 is finished, is masked out. The backward pass walks the same lists in reverse; each (Gaussian, tile) pair has
 a private slot for its gradient, and the slots of a Gaussian are summed in a fixed order: no atomics, and the
-same bits at every run. On a GPU every pixel is a thread (kernels.pixels).
+same bits at every run. On a GPU every pixel is a thread (kernels.rasterization_gpu).
 
 Images are stored by blocks inside the kernels: [..., tiles * blocks, LANES].
 
@@ -22,10 +22,18 @@ import taichi as ti
 import torch
 from torch import Tensor
 
-from kernels import pixels
-from kernels.compositing import clear, draw, draw_backward, fill_slots, lane_columns, lane_rows, list_blocks
-from kernels.lanes import LANES, integer_lanes, lanes, sums, vector_instructions
-from kernels.projection import (
+from edslam_ti.kernels import rasterization_gpu
+from edslam_ti.kernels.compositing import (
+    clear,
+    draw,
+    draw_backward,
+    fill_slots,
+    lane_columns,
+    lane_rows,
+    list_blocks,
+)
+from edslam_ti.kernels.lanes import LANES, integer_lanes, lanes, sums, vector_instructions
+from edslam_ti.kernels.projection import (
     BLOCK,
     HALF,
     LOW_PASS,
@@ -36,8 +44,8 @@ from kernels.projection import (
     project,
     project_backward,
 )
-from kernels.runtime import CHUNK, check_shape, float_dtype, is_gpu, plain, workers
-from kernels.tile_lists import TileLists, list_pairs
+from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, is_gpu, plain, workers
+from edslam_ti.kernels.tile_lists import TileLists, list_pairs
 
 TILE = 32  # pixels; a multiple of the blocks
 
@@ -216,15 +224,15 @@ class _Rasterize(torch.autograd.Function):
         count, channels, device = len(means), colors.shape[1], means.device
         pose = plain("T_camera_world", T_camera_world)[None]
         inputs = (means, quats, scales, opacities, colors, pose, intrinsics, size, tile, low_pass)
-        projection = pixels.project(*inputs) if pixelwise else project(*inputs)
-        lists = (pixels.list_pairs if pixelwise else list_pairs)(projection, size, tile)
+        projection = rasterization_gpu.project(*inputs) if pixelwise else project(*inputs)
+        lists = (rasterization_gpu.list_pairs if pixelwise else list_pairs)(projection, size, tile)
         blocks = (len(lists.start) - 1) * (tile // BLOCK) ** 2
         drawn = torch.empty(2 + channels, blocks, LANES, dtype=float_dtype(), device=device)
         values, transmittance = drawn[:-1], drawn[-1]
         last, front = (torch.empty(blocks, LANES, dtype=torch.int32, device=device) for _ in range(2))
         visible = torch.zeros(projection.padded, dtype=torch.uint8, device=device)
         if pixelwise:
-            pixels.draw_lists(projection, lists, size, values, transmittance, last, front, visible)
+            rasterization_gpu.draw_lists(projection, lists, size, values, transmittance, last, front, visible)
         else:
             space = Workspace.of(projection, lists)
             _rasterize_forward(
@@ -249,10 +257,10 @@ class _Rasterize(torch.autograd.Function):
         grad_drawn = to_blocks(grad_images, lists.tile)
         grad_values, grad_rest = grad_drawn[:-1], grad_drawn[-1]
         if ctx.pixelwise:
-            slot_grad = pixels.draw_lists_backward(
+            slot_grad = rasterization_gpu.draw_lists_backward(
                 projection, lists, ctx.size[0], ctx.transmittance, ctx.last, grad_values, grad_rest
             )
-            gradients, grad_poses = pixels.project_backward(projection, slot_grad)
+            gradients, grad_poses = rasterization_gpu.project_backward(projection, slot_grad)
             return *gradients, grad_poses[0], *[None] * 5
         slot_grad = lists.new_slots(projection)
         space = Workspace.of(projection, lists)
@@ -290,7 +298,7 @@ def rasterize(
     if pixelwise is None:
         pixelwise = is_gpu()
     if tile is None:
-        tile = pixels.TILE if pixelwise else TILE
+        tile = rasterization_gpu.TILE if pixelwise else TILE
     check_tile(tile, size)
     outputs = _Rasterize.apply(
         means,

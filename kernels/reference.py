@@ -7,10 +7,10 @@ backward passes.
 import torch
 from torch import Tensor
 
-from kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE
-from kernels.patch_warp import ResidualModel
-from kernels.projection import LOW_PASS, MIN_ALPHA, NEAR
-from kernels.rasterization import Rasterization
+from edslam_ti.kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE
+from edslam_ti.kernels.patch_warp import ResidualModel
+from edslam_ti.kernels.projection import LOW_PASS, MIN_ALPHA, NEAR
+from edslam_ti.kernels.rasterization import Rasterization
 
 # --- time surface ---
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from kernels.runtime import check_shape
+from edslam_ti.kernels.runtime import check_shape
 
 MAX_TAPS = 4
 INVALID = 0xFFFFFFFF  # Open3D's primitive id of a ray that hits nothing

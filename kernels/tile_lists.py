@@ -11,8 +11,8 @@ import taichi as ti
 import torch
 from torch import Tensor
 
-from kernels.projection import NOT_DRAWN, Projection, gradient_size, unpack_tiles
-from kernels.runtime import CHUNK, workers
+from edslam_ti.kernels.projection import NOT_DRAWN, Projection, gradient_size, unpack_tiles
+from edslam_ti.kernels.runtime import CHUNK, workers
 
 RADIX_BITS = 11  # three digits hold the 31 bits of a positive float
 RADIX = 2**RADIX_BITS

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 import taichi as ti
 
-from kernels.runtime import CHUNK, check_shape, workers
+from edslam_ti.kernels.runtime import CHUNK, check_shape, workers
 
 MANY_EVENTS = 500_000  # below this numpy is done before a second core has woken up
 ROUNDS = 4  # at most, newest events first, until every pixel has had one

@@ -17,7 +17,7 @@ import taichi as ti
 import torch
 from torch import Tensor
 
-from kernels.compositing import (
+from edslam_ti.kernels.compositing import (
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     clear,
@@ -27,8 +27,8 @@ from kernels.compositing import (
     list_blocks,
     log_255_alpha,
 )
-from kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions, zeros
-from kernels.projection import (
+from edslam_ti.kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions, zeros
+from edslam_ti.kernels.projection import (
     BLOCK,
     FEATURES,
     LOW_PASS,
@@ -39,7 +39,7 @@ from kernels.projection import (
     project,
     project_backward,
 )
-from kernels.rasterization import (
+from edslam_ti.kernels.rasterization import (
     TILE,
     Workspace,
     check_gaussians,
@@ -48,8 +48,8 @@ from kernels.rasterization import (
     rasterize,
     to_blocks,
 )
-from kernels.runtime import CHUNK, check_shape, is_gpu, plain
-from kernels.tile_lists import list_pairs
+from edslam_ti.kernels.runtime import CHUNK, check_shape, is_gpu, plain
+from edslam_ti.kernels.tile_lists import list_pairs
 
 ALPHA, WEIGHT = 0, 1  # what is kept of every record that a block draws
 

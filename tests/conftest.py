@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import edslam_ti  # noqa: F401  (sets the threading environment before torch loads)
-import kernels
+from edslam_ti import kernels
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from edslam_ti.baselines import METHODS
 from edslam_ti.config import Config
-from edslam_ti.contrast import ContrastThreshold
 from edslam_ti.datasets import EventDepthSequence, Sample
-from edslam_ti.evaluation import trajectory_errors
+from edslam_ti.evaluation.images import trajectory_errors
+from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.events import Events
 from edslam_ti.frame import FrameBuilder
+from edslam_ti.methods import METHODS
 from edslam_ti.simulation import HandHeldPath, Room, SimulationConfig, simulate
 from edslam_ti.simulation.rooms import RoomBuilder
 from edslam_ti.simulation.scene import Material
 from edslam_ti.simulation.textures import abstract
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import TruePoses
+from edslam_ti.tracking.tracker import TruePoses
 
 # 15 depth images, 30 cm of path: long enough to drift, short enough to map within seconds.
 TINY = SimulationConfig(width=120, height=80, duration=0.7)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import BaseModel
-from test_event_replica import save_events, some_events, write_sequence
+from written_sequences import save_events, some_events, write_sequence
 
-from edslam_ti.baselines import METHODS
 from edslam_ti.command_line import launch, parse_config
 from edslam_ti.config import Config
 from edslam_ti.datasets import open_sequence
+from edslam_ti.methods import METHODS
 
 ROOT = Path(__file__).parents[1]
 APP = ROOT / "apps" / "slam.py"

@@ -7,7 +7,7 @@ from edslam_ti.config import TimeSurfaceConfig
 from edslam_ti.datasets import Sample
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame, FrameBuilder
-from edslam_ti.surface_frame import SurfaceFrame, SurfaceFrameBuilder
+from edslam_ti.tracking.surfaces import SurfaceFrame, SurfaceFrameBuilder
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
 SHARP = TimeSurfaceConfig(decay=0.1, blur=0)

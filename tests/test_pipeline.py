@@ -18,16 +18,18 @@ import yaml
 from rich.console import Console
 from sequences import settings
 
-from edslam_ti import evaluation, pipeline, results
+from edslam_ti import pipeline
 from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
-from edslam_ti.export import read_gaussian_ply
-from edslam_ti.mapping import GaussianMapper
+from edslam_ti.evaluation import images as evaluation
+from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.pipeline import held_out_frames, run
+from edslam_ti.results import folder as results
+from edslam_ti.results.export import read_gaussian_ply
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import TrackingResult
+from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import read_tum
 
 ROOT = Path(__file__).parents[1]

@@ -8,7 +8,7 @@ from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame, FrameBuilder
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import TrackingResult
+from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)

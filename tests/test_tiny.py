@@ -14,12 +14,12 @@ from edslam_ti.config import TimeSurfaceConfig
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.events import Events
 from edslam_ti.frame import FrameBuilder
-from edslam_ti.losses import brightness_change, event_loss
-from edslam_ti.mapping import GaussianMapper
-from edslam_ti.rendering import render
-from edslam_ti.surface_frame import SurfaceFrameBuilder
+from edslam_ti.kernels.time_surface import count_events
+from edslam_ti.mapping.gaussian_mapper import GaussianMapper
+from edslam_ti.mapping.losses import brightness_change, event_loss
+from edslam_ti.mapping.rendering import render
+from edslam_ti.tracking.surfaces import SurfaceFrameBuilder
 from edslam_ti.trajectory import Trajectory, read_tum, write_tum
-from kernels.time_surface import count_events
 
 
 def summed_polarity(chunks: list[Events], shape: tuple[int, int]) -> np.ndarray:  # [H, W] float32

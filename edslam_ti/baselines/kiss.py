@@ -10,7 +10,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.frame import Frame
-from edslam_ti.tracking import TrackingResult
+from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
 
 MAX_RANGE, MIN_RANGE = 10.0, 0.1  # metres

@@ -16,12 +16,12 @@ from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.errors import DataError
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import orthonormalized, rotation_angle_deg
-from edslam_ti.mapping import Progress
+from edslam_ti.mapping.mapper import Progress
+from edslam_ti.mapping.rendering import View
+from edslam_ti.mapping.volume import MeshView, TsdfVolume
 from edslam_ti.open3d_loader import load_open3d
-from edslam_ti.rendering import View
-from edslam_ti.tracking import TrackingResult
+from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
-from edslam_ti.volume import MeshView, TsdfVolume
 
 MAX_DEPTH = 10.0  # metres
 VOXEL_SIZE = 0.02  # metres

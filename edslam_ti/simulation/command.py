@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-import kernels
+from edslam_ti import kernels
 from edslam_ti.errors import ConfigError
 from edslam_ti.simulation.catalogue import make_room
 from edslam_ti.simulation.mesh import load_mesh

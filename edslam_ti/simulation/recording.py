@@ -19,6 +19,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
+from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
 from edslam_ti.output import atomic_folder
 from edslam_ti.simulation.depth_noise import kinect_depth
 from edslam_ti.simulation.paths import CameraPath
@@ -26,7 +27,6 @@ from edslam_ti.simulation.renderer import Render, Renderer
 from edslam_ti.simulation.scene import Scene
 from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_truth
-from kernels.event_simulation import EventArrays, EventSensorState, simulate_events
 
 MILLISECOND = 1_000_000  # nanoseconds
 HEADER_BYTES = 128  # of the event file

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.kernels.texture import mark_edges, pixel_rays, shade, write_sample_means
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.simulation.scene import Scene
-from kernels.texture import mark_edges, pixel_rays, shade, write_sample_means
 
 EDGE_CONTRAST = 0.02  # Michelson contrast between neighbouring surfaces from which an edge is refined
 

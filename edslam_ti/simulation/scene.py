@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edslam_ti.errors import DataError
-from kernels.texture import TextureTable, TriangleTable
+from edslam_ti.kernels.texture import TextureTable, TriangleTable
 
 TEXEL = 0.004  # metres per texel of tiled textures
 NO_LIGHT = -1

@@ -1,0 +1,89 @@
+"""Levenberg-Marquardt on SE(3): alignment of images and depth, whatever is aligned to what (Eq. 5)."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from edslam_ti.camera import Camera
+from edslam_ti.config import TrackingConfig
+from edslam_ti.geometry import exp_matrix, rigid_inverse
+from edslam_ti.kernels.patch_warp import Alignment, Direction, NormalEquations, ResidualModel
+
+MIN_PIXELS = 200  # fewer residuals than this constrain no pose
+MAX_CONDITION = 1e7  # of the normal equations: beyond, some motion is not observed
+SMALL_GAIN = 1e-4  # relative decrease of the cost: converged
+
+
+def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualModel:
+    """Return how residuals are weighted, given the standard deviation of those of what is aligned."""
+    return ResidualModel(
+        max_depth_difference=config.max_depth_difference,
+        surface_sigma=surface_sigma,
+        depth_weight=config.depth_weight,
+        depth_sigma=config.depth_sigma,
+        depth_sigma_2=config.depth_sigma_2,
+        huber_threshold=config.huber_threshold,
+    )
+
+
+def is_observed(system: NormalEquations) -> bool:
+    """Return whether all six motions show in what is aligned (well-conditioned normal equations)."""
+    eigenvalues = np.linalg.eigvalsh(system.H)
+    return bool(eigenvalues[0] > eigenvalues[-1] / MAX_CONDITION)
+
+
+def linearised(
+    points: Tensor,  # of the reference
+    model: ResidualModel,
+    view: list[np.ndarray],  # [h, w] log brightness and depth (metres, 0 = missing)
+    camera: Camera,  # of the view
+) -> Callable[[np.ndarray], NormalEquations]:
+    """Return the normal equations of a view's alignment as a function of T_reference_camera."""
+    alignment = Alignment([Direction(points, 0, model)], cv2.merge(view)[None], camera.intrinsics)
+
+    def linearise(T_reference_camera: np.ndarray) -> NormalEquations:
+        # T exp(xi) moves T_camera_reference to exp(-xi) T_camera_reference
+        (system,) = alignment.linearise([rigid_inverse(T_reference_camera)])
+        return system.transformed(-np.eye(6))
+
+    return linearise
+
+
+def levenberg_marquardt(
+    linearise: Callable[[np.ndarray], NormalEquations],
+    T_world_camera: np.ndarray,  # [4, 4] start
+    iterations: int,
+    small_gain: float = SMALL_GAIN,
+) -> tuple[np.ndarray, NormalEquations]:
+    """Minimise over T <- T exp(xi), given the normal equations at a pose; return pose and system.
+
+    It ends when the cost decreases by less than `small_gain` of itself.
+    """
+    T, damping = T_world_camera, 1e-4
+    system = linearise(T)
+    for _ in range(iterations):
+        if system.num_surface < MIN_PIXELS or system.cost == 0:
+            break
+        H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
+        candidate_T = T @ exp_matrix(-np.linalg.solve(H, system.g))
+        candidate = linearise(candidate_T)
+        gain = 1 - _mean_cost(candidate) / _mean_cost(system)
+        if gain > 0:
+            T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
+            if gain < small_gain:
+                break
+        else:
+            damping *= 8
+            if damping > 1e3:
+                break
+    return T, system
+
+
+def _mean_cost(system: NormalEquations) -> float:
+    """Return the cost per visible pixel, with a charge for pixels lost from view."""
+    if system.num_surface == 0:
+        return np.inf
+    lost = max(system.num_usable - system.num_surface, 0)
+    return (system.cost + 1.0 * lost) / max(system.num_usable, 1)

@@ -1,0 +1,1 @@
+"""Errors of trajectories, images and meshes."""

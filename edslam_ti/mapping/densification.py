@@ -1,0 +1,97 @@
+"""More Gaussians where images ask for them: clone, split, prune, opacity reset (Kerbl et al. 2023, Sec. 5.2).
+
+Thresholds are those of gsplat's DefaultStrategy, gradients in its units (half an image width). It starts from
+sparse points, whereas depth puts a Gaussian at every second pixel here (Eq. 13), so that this is optional.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edslam_ti.camera import Camera
+from edslam_ti.geometry import inverse
+from edslam_ti.mapping.gaussians import GaussianMap
+
+SMALL = 0.01  # of the scene's size: larger Gaussians are split, smaller ones cloned (gsplat: grow_scale3d)
+LARGE = 0.1  # of the scene's size: beyond, a Gaussian is pruned (gsplat: prune_scale3d)
+SHRINKING = 1.6  # by which the halves of a split Gaussian are smaller
+FAINTEST = 0.005  # opacity; opacities are reset to twice as much (gsplat: prune_opa)
+
+
+class Densifier:
+    """Adds up how strongly images pull at every Gaussian, and refines the map accordingly."""
+
+    def __init__(self, camera: Camera, size: float, min_gradient: float, most: int, seed: int) -> None:
+        """Start with nothing seen.
+
+        `size` of the scene in metres; `min_gradient`: mean pull from which on one Gaussian becomes two;
+        `most`: Gaussians that the map may hold.
+        """
+        self._camera = camera
+        self._size = size
+        self._min_gradient = min_gradient
+        self._most = most
+        self._generator = torch.Generator().manual_seed(seed)
+        self._pull = torch.zeros(0)  # [N] sum of gradients
+        self._count = torch.zeros(0)  # [N] views that they are from
+
+    @torch.no_grad()
+    def observe(
+        self,
+        num_gaussians: int,
+        chosen: Tensor,  # [M] indices of the Gaussians in view
+        means: Tensor,  # [M, 3] metres, world
+        gradient: Tensor,  # [M, 3] of the loss in the means
+        T_world_camera: Tensor,  # [4, 4]
+    ) -> None:
+        """Take in one view's gradients; the number of Gaussians may have changed only by `refine`."""
+        if len(self._pull) != num_gaussians:
+            self._pull, self._count = torch.zeros(num_gaussians), torch.zeros(num_gaussians)
+        T = inverse(T_world_camera.detach()).float()
+        p, g = means @ T[:3, :3].T + T[:3, 3], gradient @ T[:3, :3].T
+        ray = p / p.norm(dim=1, keepdim=True)
+        across = g - (g * ray).sum(1, keepdim=True) * ray  # moves it in the image, p = z / f pixels
+        pixels = across.norm(dim=1) * p[:, 2] / self._camera.fx
+        is_drawn = pixels > 0
+        self._pull.index_add_(0, chosen, pixels * self._camera.width / 2)
+        self._count.index_add_(0, chosen, is_drawn.float())
+
+    @torch.no_grad()
+    def refine(self, gaussians: GaussianMap) -> None:
+        """Clone small and split large Gaussians that are pulled at, prune faint and huge ones; begin anew."""
+        is_pulled = self._pull / self._count.clamp_min(1) > self._min_gradient
+        largest = gaussians.raw["log_scales"].amax(1).exp()
+        is_small = largest <= SMALL * self._size
+        room = max(self._most - len(gaussians), 0)
+        split = torch.nonzero(is_pulled & ~is_small).squeeze(1)[:room]
+        cloned = torch.nonzero(is_pulled & is_small).squeeze(1)[: room - len(split)]
+        gaussians.clone(cloned)
+        self._split(gaussians, split)
+        opacity, largest = (
+            gaussians.raw["logit_opacities"].sigmoid(),
+            gaussians.raw["log_scales"].amax(1).exp(),
+        )
+        gaussians.keep((opacity > FAINTEST) & (largest < LARGE * self._size))
+        self._pull, self._count = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+
+    def _split(self, gaussians: GaussianMap, chosen: Tensor) -> None:
+        """Replace each by two smaller ones, drawn from it."""
+        both = torch.cat([chosen, gaussians.clone(chosen)])
+        raw = {name: gaussians.raw[name][both] for name in ("means", "quats", "log_scales")}
+        within = raw["log_scales"].exp() * torch.randn(len(both), 3, generator=self._generator)
+        gaussians.overwrite("means", both, raw["means"] + _rotated(within, raw["quats"]))
+        gaussians.overwrite("log_scales", both, raw["log_scales"] - np.log(SHRINKING))
+
+    @torch.no_grad()
+    def reset_opacities(self, gaussians: GaussianMap) -> None:
+        """Make all Gaussians faint: those that images need come back, floaters do not."""
+        everyone = torch.arange(len(gaussians))
+        faint = torch.tensor(2 * FAINTEST).logit()
+        gaussians.overwrite("logit_opacities", everyone, gaussians.raw["logit_opacities"].clamp_max(faint))
+
+
+def _rotated(vectors: Tensor, quats: Tensor) -> Tensor:  # [N, 3], [N, 4] wxyz of any norm -> [N, 3]
+    unit = quats / quats.norm(dim=1, keepdim=True)
+    w, axis = unit[:, :1], unit[:, 1:]
+    turned = torch.linalg.cross(axis, vectors)
+    return vectors + 2 * (w * turned + torch.linalg.cross(axis, turned))

@@ -1,0 +1,110 @@
+"""Views of a Gaussian map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edslam_ti.camera import Camera
+from edslam_ti.geometry import inverse
+from edslam_ti.kernels import culling
+from edslam_ti.kernels.projection import LOW_PASS
+from edslam_ti.kernels.rasterization import rasterize
+from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
+
+MIN_DRAWN = 1e-3  # alpha; below this there is no depth to speak of
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """A rendered view, differentiable in the map and the pose."""
+
+    intensity: Tensor  # [H, W] brightness, background included
+    depth: Tensor  # [H, W] metres, weighted by alpha (Eq. 8)
+    alpha: Tensor  # [H, W]
+    visible: Tensor  # [N] bool, Sec. III-E
+    dominant: Tensor  # [H, W] int32, the Gaussian seen at each pixel, -1 where there is none
+
+    @property
+    def expected_depth(self) -> Tensor:
+        """Depth of what is drawn: Eq. 8's sum divided by alpha, 0 where nothing is drawn."""
+        depth = self.depth / self.alpha.clamp_min(MIN_DRAWN)
+        return torch.where(self.alpha > MIN_DRAWN, depth, torch.zeros_like(depth))
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered view as plain arrays: what every method's mapper can show."""
+
+    intensity: np.ndarray  # [H, W] float32 brightness
+    depth: np.ndarray  # [H, W] float32 metres, 0 = nothing drawn
+    alpha: np.ndarray  # [H, W] float32
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    T_world_camera: Tensor,  # [4, 4]
+    background: float,  # brightness behind everything
+    reduction: int = 1,  # render at 1 / reduction of the camera's size
+) -> RenderOutput:
+    """Return the map seen from a pose (Eq. 6-8), at full size or as the mean of blocks of pixels."""
+    at_size = camera if reduction == 1 else camera.downscaled(reduction)
+    drawn = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+        inverse(T_world_camera).float(),
+        at_size.intrinsics,
+        (at_size.width, at_size.height),
+        low_pass=reduced_low_pass(reduction),
+    )
+    intensity = drawn.image[..., 0] + (1 - drawn.alpha) * background
+    return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible, drawn.dominant)
+
+
+@torch.no_grad()
+def drawable(
+    gaussians: GaussianMap,  # of N
+    camera: Camera,
+    T_world_camera: Tensor,  # [4, 4]
+) -> Tensor:  # [M] indices
+    """Return the Gaussians that may show; the others lie behind the camera or end outside the image."""
+    raw, T_camera_world = gaussians.raw, inverse(T_world_camera.detach())
+    size = camera.width, camera.height
+    return culling.drawable(raw["means"], raw["log_scales"], T_camera_world, camera.intrinsics, size)
+
+
+def reduced_low_pass(reduction: int) -> float:
+    """Return the filter, in reduced px^2, that blurs like the full-size one and averages the blocks."""
+    block_variance = (reduction**2 - 1) / 12
+    return (LOW_PASS + block_variance) / reduction**2
+
+
+@torch.no_grad()
+def render_view(
+    gaussians: GaussianMap, camera: Camera, T_world_camera: np.ndarray, background: float
+) -> View:
+    """Return a view as arrays, with median depth."""
+    shown, T = gaussians.activated(), torch.from_numpy(T_world_camera)
+    output = render(shown, camera, T, background)
+    return View(output.intensity.numpy(), median_depth(shown, output, T).numpy(), output.alpha.numpy())
+
+
+def median_depth(
+    gaussians: Gaussians,
+    output: RenderOutput,
+    T_world_camera: Tensor,  # [4, 4]
+) -> Tensor:  # [H, W] metres, 0 = nothing drawn
+    """Return the depth of the Gaussian at which half of the light is gone, as in Huang et al. 2024 (2DGS).
+
+    At an outline expected depth lies between two surfaces, where there is nothing. Where more than half of
+    the light passes, there is no median, and it is the expected depth.
+    """
+    _, _, row, _ = inverse(T_world_camera).float()
+    depth = gaussians.means @ row[:3] + row[3]
+    in_front = depth[output.dominant.clamp_min(0).long()] if len(depth) else output.depth
+    return torch.where(output.dominant >= 0, in_front, output.expected_depth)

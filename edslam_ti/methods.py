@@ -1,0 +1,87 @@
+"""Methods by name. A method is a pair of a Tracker and a Mapper put into the same `Slam`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # a method's parts load Taichi or Open3D, which `--help` need not wait for
+    from edslam_ti.config import Config
+    from edslam_ti.datasets import EventDepthSequence
+    from edslam_ti.event_images.contrast import ContrastThreshold
+    from edslam_ti.mapping.mapper import Mapper
+    from edslam_ti.tracking.tracker import Tracker
+
+    Build = Callable[[EventDepthSequence, ContrastThreshold, Config], tuple[Tracker, Mapper]]
+
+
+@dataclass(frozen=True)
+class Method:
+    """How to make a method's two parts, and how its settings differ from the defaults."""
+
+    description: str
+    build: "Build"  # (sequence, contrast threshold, settings) -> tracker and mapper
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _ed_slam(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.event_images.sharp import SharpImages
+    from edslam_ti.mapping.gaussian_mapper import GaussianMapper
+    from edslam_ti.tracking.image_tracker import BrightnessTracker
+    from edslam_ti.tracking.patch_tracker import BidirectionalPatchTracker
+
+    tracker: Tracker
+    surfaces, tracking = config.time_surface, config.tracking
+    if tracking.brightness:
+        tracker = BrightnessTracker(sequence.camera, contrast, surfaces, tracking, config.seed)
+    else:
+        tracker = BidirectionalPatchTracker(sequence.camera, surfaces, tracking, config.seed)
+    sharp_images = SharpImages(sequence, contrast, config.mapping) if config.mapping.frames else None
+    return tracker, GaussianMapper(sequence.camera, contrast, config, sharp_images)
+
+
+def _open3d_rgbd(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.open3d_rgbd import RgbdOdometryTracker, TsdfMapper
+
+    return RgbdOdometryTracker(sequence), TsdfMapper(sequence.camera)
+
+
+def _open3d_icp(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.open3d_rgbd import OdometryTracker, TsdfMapper
+
+    return OdometryTracker(sequence.camera, "PointToPlane"), TsdfMapper(sequence.camera)
+
+
+def _kiss_icp(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.kiss import KissIcpTracker
+    from edslam_ti.baselines.open3d_rgbd import TsdfMapper
+
+    return KissIcpTracker(sequence.camera), TsdfMapper(sequence.camera)
+
+
+METHODS: dict[str, Method] = {
+    "ed_slam": Method(
+        "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
+    ),
+    "ed_slam_paper": Method(
+        "Eq. 5 to the letter: time surfaces alone, consecutive frames, both directions",
+        _ed_slam,
+        {"tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0}},
+    ),
+    "open3d_rgbd": Method(
+        "Open3D's RGB-D odometry and TSDF volume; needs images, uses no events", _open3d_rgbd
+    ),
+    "open3d_icp": Method(
+        "Open3D's point-to-plane odometry of depth alone and TSDF volume; uses no events", _open3d_icp
+    ),
+    "kiss_icp": Method(
+        "KISS-ICP (where installed) on points of the depth images, TSDF volume; uses no events", _kiss_icp
+    ),
+}

@@ -1,0 +1,1 @@
+"""The results folder of a run: written, read, drawn."""

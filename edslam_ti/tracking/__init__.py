@@ -1,0 +1,1 @@
+"""Poses from events and depth (Sec. III-B)."""

@@ -1,0 +1,403 @@
+"""The mapper: where Gaussians are added, what they are optimised for, and what is never looked at."""
+
+import itertools
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sequences import make_slam, settings
+
+from edslam_ti.datasets import EventDepthSequence, Sample
+from edslam_ti.evaluation.images import depth_l1_cm, evaluate_images
+from edslam_ti.geometry import exp_matrix
+from edslam_ti.mapping.gaussian_mapper import (
+    GaussianMapper,
+    PoseRefiner,
+    densify_mask,
+    spaced,
+    stride_in_room,
+)
+from edslam_ti.mapping.insertion import beside_steps
+from edslam_ti.mapping.rendering import render
+from edslam_ti.mapping.targets import EventImages
+from edslam_ti.slam import Slam
+from edslam_ti.tracking.tracker import TruePoses
+from edslam_ti.trajectory import Trajectory
+
+FEW = {"iterations": 1, "final_iterations": 3}
+
+
+def mapped(
+    sequence: EventDepthSequence,
+    samples: list[Sample],
+    held_out: set[int] | None = None,
+    poses: str = "truth",
+    finish: bool = True,
+    **mapping: Any,
+) -> tuple[Slam, GaussianMapper]:
+    """Return a run over the samples, and its mapper."""
+    slam = make_slam(sequence, samples, settings(poses=poses, mapping=FEW | mapping))
+    for k, sample in enumerate(samples):
+        slam.process(sample, is_held_out=k in (held_out or set()))
+    assert isinstance(slam.mapper, GaussianMapper)
+    if finish:
+        slam.mapper.finish(slam.trajectory, lambda fraction: True)
+    return slam, slam.mapper
+
+
+def corrected_psnr(mapper: GaussianMapper, slam: Slam, samples: list[Sample], indices: list[int]) -> float:
+    """Return the PSNR in dB of views after EventNeRF's fit."""
+    views = [mapper.render(mapper._camera, slam.trajectory.pose(k)).intensity for k in indices]
+    truths = [image for k in indices if (image := samples[k].image) is not None]
+    measured = evaluate_images(views, truths, [np.ones(t.shape, bool) for t in truths])
+    assert measured.psnr_corrected_db is not None
+    return measured.psnr_corrected_db
+
+
+# --- what it achieves ---
+
+
+def test_mapping_raises_the_psnr_of_held_out_views(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    held_out = {3, 8, 12}
+    untouched: dict[str, Any] = {"iterations": 0, "final_iterations": 0}
+    slam, blank = mapped(tiny_sequence, tiny_samples, held_out, finish=False, **untouched)
+    before = corrected_psnr(blank, slam, tiny_samples, sorted(held_out))
+    steps = {"iterations": 8, "final_iterations": 100}
+    slam, mapper = mapped(tiny_sequence, tiny_samples, held_out, **steps)
+    after = corrected_psnr(mapper, slam, tiny_samples, sorted(held_out))
+    assert after > before + 5  # 13 dB to 22 dB was measured
+    assert after > 18
+    assert mapper.loss < 0.5
+
+
+def test_map_is_the_same_twice_to_the_last_bit(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    a, b = (mapped(tiny_sequence, tiny_samples[:6], poses="tracked") for _ in range(2))
+    for name, values in a[1].gaussians.raw.items():
+        assert (values == b[1].gaussians.raw[name]).all(), name
+    assert (a[0].trajectory.poses == b[0].trajectory.poses).all()
+
+
+# --- what it never looks at ---
+
+
+def test_depth_of_held_out_frames_is_never_used(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    samples, held_out = tiny_samples[:8], {2, 5}
+    poisoned = list(samples)
+    for k in held_out:
+        depth = samples[k].depth
+        assert depth is not None
+        poisoned[k] = replace(samples[k], depth=0.5 * depth)
+    (_, clean), (_, other) = (mapped(tiny_sequence, s, held_out) for s in (samples, poisoned))
+    assert clean.num_gaussians == other.num_gaussians
+    for name, values in clean.gaussians.raw.items():
+        assert (values == other.gaussians.raw[name]).all(), name
+
+
+def test_images_are_never_used(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    samples = tiny_samples[:6]
+    blind = [replace(s, image=None) for s in samples]
+    (_, clean), (_, other) = (mapped(tiny_sequence, s, poses="tracked") for s in (samples, blind))
+    assert (clean.gaussians.raw["logit_colors"] == other.gaussians.raw["logit_colors"]).all()
+
+
+def test_images_from_events_exist_at_every_frame_but_held_out_ones(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples, held_out={3, 8, 12}, finish=False)
+    assert mapper.images.frames == [k for k in range(len(tiny_samples)) if k not in (3, 8, 12)]
+    drawn = {mapper._draw_recent() for _ in range(200)} | {mapper._draw_any() for _ in range(20)}
+    assert drawn == set(mapper.images.frames)
+
+
+# --- growing and pruning ---
+
+
+def test_densify_mask_is_the_truth_table_of_eq_13() -> None:
+    depth = np.array([[2.0, 2.0, 2.0, 0.0, 2.0, 2.0]])
+    alpha = np.array([[0.9, 0.7, 0.9, 0.1, 0.9, 0.9]])
+    rendered = np.array([[2.01, 2.0, 3.0, 0.0, 2.01, 2.01]])
+    mask = densify_mask(alpha, rendered, depth, min_visibility=0.8, depth_error_factor=50.0)
+    # well seen | transparent | 100 times the median error | nothing measured | well seen ...
+    assert mask.tolist() == [[False, True, True, False, False, False]]
+
+
+def test_empty_map_needs_gaussians_wherever_there_is_depth() -> None:
+    depth = np.array([[1.0, 0.0], [2.0, 3.0]])
+    nothing = np.zeros_like(depth)
+    assert (densify_mask(nothing, nothing, depth, 0.8, 50.0) == (depth > 0)).all()
+    assert not densify_mask(nothing, nothing, nothing, 0.8, 50.0).any()
+
+
+def test_mapped_pixels_get_no_second_gaussians(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, first = mapped(tiny_sequence, tiny_samples[:1])
+    assert tiny_samples[0].depth is not None
+    spacing = np.where(beside_steps(tiny_samples[0].depth), 1, 2)
+    assert 120 * 80 / 4 < spaced(spacing).sum() == first.num_gaussians
+    _, all_of_them = mapped(tiny_sequence, tiny_samples, iterations=0)
+    # 14 views of nearly the same walls: what is new is the gaps between small discs, the rim, behind edges.
+    assert first.num_gaussians < all_of_them.num_gaussians < 4 * first.num_gaussians
+
+
+def test_view_of_what_may_show_is_that_of_the_whole_map(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:2], iterations=0, finish=False)
+    T = slam.trajectory.pose(0) @ exp_matrix(np.array([0.1, 0.0, -0.2, 0.1, 0.4, 0.0]))
+    with torch.no_grad():
+        whole = render(mapper.gaussians.activated(), mapper._camera, torch.from_numpy(T), 0.5)
+    part = mapper._render(T)
+    assert int((whole.dominant < 0).sum()) > 0  # turned so far that the map ends inside the view
+    for name in ("intensity", "depth", "alpha", "visible", "dominant"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)), name
+
+
+def test_map_never_exceeds_its_largest_size(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:6], max_gaussians=1500)
+    assert 1000 < mapper.num_gaussians <= 1500
+
+
+def test_fuller_maps_grow_by_coarser_gaussians() -> None:
+    strides = [stride_in_room(2, share) for share in (0.0, 0.5, 0.75, 0.9, 0.99, 1.0)]
+    assert strides == [2, 2, 3, 5, 15, 64]
+
+
+def test_one_pixel_is_taken_of_every_block_as_wide_as_the_spacing() -> None:
+    spacing = np.full((6, 9), 3)
+    spacing[:, 3:] = 1
+    expected = np.ones((6, 9), bool)
+    expected[:, :3] = False
+    expected[[1, 4], 1] = True
+    assert (spaced(spacing) == expected).all()
+
+
+def test_small_map_covers_more_of_what_comes_late(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gaps() -> float:
+        slam, mapper = mapped(tiny_sequence, tiny_samples, max_gaussians=3300, final_iterations=30)
+        assert mapper.num_gaussians <= 3300  # 2677 are of the first view
+        last = mapper.render(mapper._camera, slam.trajectory.pose(len(tiny_samples) - 1))
+        return float((last.alpha < 0.5).mean())
+
+    coarser = gaps()
+    monkeypatch.setattr("edslam_ti.mapping.gaussian_mapper.stride_in_room", lambda stride, fullness: stride)
+    assert coarser < 0.8 * gaps()
+
+
+def test_map_of_a_few_gaussians_is_refined_like_any_other(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:6], finish=False, max_gaussians=4, min_opacity=0.0)
+    mapper.gaussians.raw["means"].data[1:] += 50.0  # out of sight: a single one is seen
+    mapper.finish(slam.trajectory, lambda fraction: True)
+    assert mapper.num_gaussians == 4
+    assert np.isfinite(mapper.points()[1]).all()
+
+
+def test_map_follows_when_a_revisit_corrects_the_path(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = [tiny_sequence.true_pose(s.timestamp) for s in tiny_samples]
+    drift = np.array([2e-3, 0.0, 8e-3, 0.0, 1e-3, 5e-4])  # a frame: 12 cm and a degree in all
+
+    def depth_error(share: float = 1.0) -> float:
+        """Return the depth L1 (cm) of a map whose path, drifted, was corrected before its last frame."""
+        *before, last = tiny_samples
+        poses = {
+            s.timestamp: T @ exp_matrix(share * k * drift) for k, (s, T) in enumerate(zip(before, truth))
+        }
+        slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW))
+        slam.tracker = TruePoses(poses.get)
+        for sample in before:
+            slam.process(sample)
+        for k, T in enumerate(truth[:-1]):
+            slam.trajectory.replace(k, T)
+        slam.tracker = TruePoses(tiny_sequence.true_pose)
+        slam.process(last, is_held_out=True)
+        assert isinstance(slam.mapper, GaussianMapper)
+        views = [slam.mapper.render(tiny_sequence.camera, T).depth for T in truth]
+        error = depth_l1_cm(views, [s.depth for s in tiny_samples])
+        assert error is not None
+        return error
+
+    clean, following = depth_error(share=0.0), depth_error()
+    monkeypatch.setattr(GaussianMapper, "_follow", lambda self, trajectory: None)
+    staying = depth_error()
+    assert following - clean < 0.5 * (staying - clean)
+
+
+def test_start_image_is_solved_as_often_when_frames_are_forgotten(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edslam_ti.mapping.gaussian_mapper.SOLVE_EVERY", 3)
+    slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW | {"max_views": 10}))
+    assert isinstance(slam.mapper, GaussianMapper)
+    images, solved_at = slam.mapper.images, []
+
+    def solve(*given: Any) -> bool:
+        solved_at.append(len(slam.trajectory))
+        return EventImages.solve(images, *given)
+
+    monkeypatch.setattr(images, "solve", solve)
+    for sample in tiny_samples[:12]:
+        slam.process(sample, is_held_out=False)
+    assert solved_at[-3:] == [6, 9, 12]
+
+
+def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:5], finish=False)
+    before = mapper.num_gaussians
+    logits = mapper.gaussians.raw["logit_opacities"]
+    logits.data[:100] = -10.0
+    mapper.finish(slam.trajectory, lambda fraction: True)
+    assert before - 150 < mapper.num_gaussians <= before - 100
+
+
+def test_first_frame_and_distant_frames_are_keyframes(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples, held_out={7})
+    indices = [k.index for k in mapper.keyframes]
+    assert indices[0] == 0
+    assert 2 <= len(indices) < len(tiny_samples) / 2  # 22 cm at a depth of 1.6 m, one every 8 cm
+    assert 7 not in indices
+
+
+# --- computing time ---
+
+
+def test_without_budget_every_step_is_taken(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:8], iterations=2, final_iterations=7)
+    assert mapper.num_steps >= 7 + 2 * 3
+    assert mapper.budget.left() == np.inf
+    assert mapper.budget.spent > 0
+
+
+def test_budget_leaves_out_steps_and_is_kept_to(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tick, ticks = 0.01, itertools.count()  # a clock that every look at it moves on: a busy machine, too
+    clock = SimpleNamespace(perf_counter=lambda: tick * next(ticks))
+    monkeypatch.setattr("edslam_ti.mapping.gaussian_mapper.time", clock)
+    many: dict[str, Any] = {"iterations": 50, "final_iterations": 5000}
+    slam, mapper = mapped(tiny_sequence, tiny_samples, budget=6.0, **many)
+    allowed = 6.0 * (slam.trajectory.timestamps[-1] - slam.trajectory.timestamps[0])
+    assert 0.5 * allowed < tick * mapper.num_steps < allowed
+    assert mapper.budget.spent < allowed + 2 * tick  # the step in progress
+    assert corrected_psnr(mapper, slam, tiny_samples, [3, 8, 12]) > 15
+
+
+def test_too_small_a_budget_still_gives_a_map(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:8], budget=1e-6, iterations=5, final_iterations=500)
+    assert mapper.num_gaussians > 2000
+    assert mapper.num_steps == 1  # the first final one finds the time is up
+    assert mapper.budget.left() < 0
+
+
+# --- poses ---
+
+
+def test_bundle_adjustment_moves_tracked_poses_but_not_the_first(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:6], poses="tracked", finish=False)
+    before = slam.trajectory.poses
+    mapper._config = mapper._config.model_copy(update={"final_iterations": 20})
+    mapper.finish(slam.trajectory, lambda fraction: True)
+    moved = np.linalg.norm(slam.trajectory.poses[:, :3, 3] - before[:, :3, 3], axis=1)
+    assert moved[0] == 0  # the gauge
+    assert 0 < moved[1:].max() < 0.001  # at most 20 steps of 20 um a coordinate
+
+
+def test_frames_without_depth_come_half_way_to_where_the_map_looks_like_their_images(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    sparse = [replace(s, depth=s.depth if k % 3 == 0 else None) for k, s in enumerate(tiny_samples)]
+    slam, mapper = mapped(tiny_sequence, sparse, final_iterations=30)
+    shift = exp_matrix(np.array([0.004, 0.003, 0, 0, 0, 0]))
+    true = slam.trajectory.poses
+    for k in range(1, len(sparse)):
+        slam.trajectory.replace(k, true[k] @ shift)
+    mapper._align(slam.trajectory)
+    error = np.linalg.norm(slam.trajectory.poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    with_depth = np.arange(len(sparse)) % 3 == 0
+    np.testing.assert_allclose(error[with_depth][1:], 0.005, rtol=1e-6)
+    assert 0.0015 < np.median(error[~with_depth]) < 0.0035
+
+
+def test_a_map_that_looks_otherwise_moves_no_pose(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    _, mapper = mapped(tiny_sequence, tiny_samples[:5])
+    nothing = np.zeros(tiny_sequence.camera.shape, np.float32)
+    T = np.eye(4)
+    assert (mapper._aligner.corrected(nothing, nothing, nothing + 2, nothing + 1, T) == T).all()  # no texture
+    assert (mapper._aligner.corrected(nothing, nothing, nothing, nothing, T) == T).all()  # no map
+
+
+def test_true_poses_are_not_adjusted(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    slam, _ = mapped(tiny_sequence, tiny_samples[:6], final_iterations=6)
+    truth = np.array([s.T_world_camera for s in tiny_samples[:6]])
+    assert (slam.trajectory.poses == truth).all()
+
+
+def test_pose_refiner_descends_by_its_rate_in_the_camera_frame() -> None:
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # the camera's x is the world's y
+    trajectory = Trajectory(np.array([0.0, 1.0]), np.stack([np.eye(4), T]))
+    PoseRefiner(rate=1e-3).step(1, np.array([5.0, 0, 0, 0, 0, 0]), trajectory)
+    np.testing.assert_allclose(trajectory.pose(1)[:3, 3], [0, -1e-3, 0], atol=1e-9)
+    assert (trajectory.pose(0) == np.eye(4)).all()
+
+
+def test_finish_stops_when_asked_to(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:5], finish=False, final_iterations=1000)
+    told: list[float] = []
+
+    def stop_at_third(fraction: float) -> bool:
+        told.append(fraction)
+        return len(told) < 3
+
+    mapper.finish(slam.trajectory, stop_at_third)
+    assert told == pytest.approx([0.001, 0.002, 0.003])
+
+
+# --- input that fails ---
+
+
+def test_run_without_any_depth_makes_no_map_and_no_error(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    zeros = np.zeros(tiny_sequence.camera.shape, np.float32)
+    _, mapper = mapped(tiny_sequence, [replace(s, depth=zeros) for s in tiny_samples[:6]])
+    assert mapper.num_gaussians == 0
+    assert mapper.points()[0].shape == (0, 3)
+    view = mapper.render(tiny_sequence.camera, np.eye(4))
+    assert (view.alpha == 0).all()
+
+
+def test_depth_image_of_zeros_and_frames_without_depth_are_passed_over(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    zeros = np.zeros(tiny_sequence.camera.shape, np.float32)
+    samples = [replace(s, depth=[s.depth, zeros, None][k % 3]) for k, s in enumerate(tiny_samples[:7])]
+    _, mapper = mapped(tiny_sequence, samples)
+    assert mapper.num_gaussians >= 120 * 80 / 4
+    assert np.isfinite(mapper.loss)

@@ -1,0 +1,118 @@
+"""Depth to points, and their spacing."""
+
+import numpy as np
+import pytest
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import DataError
+from edslam_ti.mapping.insertion import beside_steps, depth_to_points, surface_discs, with_holes_filled
+
+CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
+
+
+def random_depth(seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    depth = random.uniform(0.5, 4.0, CAMERA.shape).astype(np.float32)
+    depth[random.random(CAMERA.shape) < 0.3] = 0
+    return depth
+
+
+def pose() -> np.ndarray:
+    T = np.eye(4)
+    c, s = np.cos(0.7), np.sin(0.7)
+    T[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    T[:3, 3] = [1.0, -2.0, 0.5]
+    return T
+
+
+def test_points_are_depth_times_the_ray_of_their_pixel() -> None:
+    depth, T = random_depth(), pose()
+    points, pixels = depth_to_points(depth, CAMERA, T)
+    x, y = pixels.T
+    expected = (depth[..., None] * CAMERA.rays())[y, x] @ T[:3, :3].T + T[:3, 3]
+    assert len(points) == np.count_nonzero(depth)
+    np.testing.assert_allclose(points, expected, atol=1e-5)  # float32 of metres
+
+
+def test_depth_of_the_principal_point_lies_on_the_optical_axis() -> None:
+    camera = Camera(width=5, height=5, fx=4.0, fy=4.0, cx=2.0, cy=1.0)
+    depth = np.zeros(camera.shape, np.float32)
+    depth[1, 2] = 3.0  # pixel centres are at integer coordinates
+    points, pixels = depth_to_points(depth, camera, np.eye(4))
+    np.testing.assert_allclose(points, [[0, 0, 3]])
+    assert pixels.tolist() == [[2, 1]]
+
+
+def test_masked_missing_and_infinite_pixels_give_no_points() -> None:
+    depth = random_depth()
+    depth[0, :3] = [np.nan, np.inf, -1.0]
+    mask = np.arange(depth.size).reshape(depth.shape) % 2 == 0
+    _, pixels = depth_to_points(depth, CAMERA, pose(), mask)
+    x, y = pixels.T
+    assert mask[y, x].all()
+    assert np.isfinite(depth[y, x]).all()
+    assert len(pixels) == np.count_nonzero(mask & np.isfinite(depth) & (depth > 0))
+
+
+def test_no_usable_depth_gives_empty_arrays() -> None:
+    points, pixels = depth_to_points(np.zeros(CAMERA.shape, np.float32), CAMERA, np.eye(4))
+    assert points.shape == (0, 3)
+    assert pixels.shape == (0, 2)
+
+
+def test_depth_of_another_size_is_an_error() -> None:
+    with pytest.raises(DataError, match=r"depth: expected shape \(6, 8\) .* got \(8, 6\)"):
+        depth_to_points(random_depth().T, CAMERA, np.eye(4))
+
+
+def test_discs_lie_on_a_tilted_plane_and_look_round_from_the_camera() -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    normal = np.array([0.6, 0.0, -0.8])
+    depth = (-2.0 / (camera.rays() @ normal)).astype(np.float32)  # the plane 2 m away along its normal
+    T = pose()
+    pixels = np.array([[31, 23], [10, 40], [50, 5]])
+    quats, stretch = surface_discs(depth, camera, T, pixels, max_stretch=10.0)
+    for (x, y), (qw, qx, qy, qz), longer in zip(pixels, quats.astype(np.float64), stretch):
+        v, w = np.array([qx, qy, qz]), qw
+        axes = np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], -1)
+        np.testing.assert_allclose(np.abs(axes[:, 2] @ T[:3, :3] @ normal), 1.0, atol=1e-4)
+        ray = camera.rays()[y, x] / np.linalg.norm(camera.rays()[y, x])
+        across, along = (T[:3, :3].T @ axes[:, k] for k in (0, 1))
+        seen = [np.linalg.norm(a - (a @ ray) * ray) for a in (across, longer * along)]
+        np.testing.assert_allclose(seen, 1.0, atol=1e-3)  # a circle, seen along the ray
+
+
+def test_disc_beside_missing_depth_or_an_edge_faces_the_camera() -> None:
+    camera = Camera(20, 10, 20.0, 20.0, 9.5, 4.5)
+    depth = np.full(camera.shape, 2.0, np.float32)
+    depth[:, 10:] = 3.0
+    depth[5, 5] = 0
+    pixels = np.array([[9, 4], [4, 5], [0, 0]])
+    _, stretch = surface_discs(depth, camera, np.eye(4), pixels, max_stretch=4.0)
+    np.testing.assert_allclose(stretch, 1.0)
+    _, stretch = surface_discs(depth, camera, np.eye(4), np.array([[2, 2]]), max_stretch=4.0)
+    assert stretch[0] > 1  # seen from the side
+
+
+def test_steps_are_found_on_both_sides_and_not_on_a_slanted_plane() -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    plane = (-2.0 / (camera.rays() @ np.array([0.8, 0.0, -0.6]))).astype(np.float32)  # 1.7 to 10 m away
+    assert not beside_steps(plane).any()
+    step = np.full(camera.shape, 2.0, np.float32)
+    step[20:, 30:] = 2.1
+    expected = np.zeros(camera.shape, bool)
+    expected[20:, 29:31] = expected[19:21, 30:] = True
+    assert (beside_steps(step) == expected).all()
+
+
+def test_large_holes_lie_behind_what_surrounds_them_and_narrow_ones_stay() -> None:
+    depth = np.full((60, 80), 2.0, np.float32)
+    depth[:, 40:] = 3.0
+    depth[10:40, 30:60] = 0  # a window
+    depth[50, :] = 0  # a line that the sensor missed
+    filled = with_holes_filled(depth)
+    assert filled[10:40, 30:60] == pytest.approx(1.25 * 3.0)
+    assert (filled[50] == 0).all()
+    measured = depth > 0
+    assert (filled[measured] == depth[measured]).all()
+    assert (with_holes_filled(np.zeros_like(depth)) == 0).all()  # nothing to go by
