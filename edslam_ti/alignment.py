@@ -8,7 +8,7 @@ from torch import Tensor
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
-from edslam_ti.geometry import exp_matrix, rigid_inverse
+from edslam_ti.geometry import inverse, se3_exp
 from edslam_ti.kernels.patch_warp import Alignment, Direction, NormalEquations, ResidualModel
 
 MIN_PIXELS = 200  # fewer residuals than this constrain no pose
@@ -45,7 +45,7 @@ def linearised(
 
     def linearise(T_reference_camera: np.ndarray) -> NormalEquations:
         # T exp(xi) moves T_camera_reference to exp(-xi) T_camera_reference
-        (system,) = alignment.linearise([rigid_inverse(T_reference_camera)])
+        (system,) = alignment.linearise([inverse(T_reference_camera)])
         return system.transformed(-np.eye(6))
 
     return linearise
@@ -67,7 +67,7 @@ def levenberg_marquardt(
         if system.num_surface < MIN_PIXELS or system.cost == 0:
             break
         H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
-        candidate_T = T @ exp_matrix(-np.linalg.solve(H, system.g))
+        candidate_T = T @ se3_exp(-np.linalg.solve(H, system.g))
         candidate = linearise(candidate_T)
         gain = 1 - _mean_cost(candidate) / _mean_cost(system)
         if gain > 0:

@@ -1,15 +1,21 @@
-"""SE(3) on torch tensors of any batch shape.
+"""SE(3): one name for each operation, on numpy arrays or torch tensors; what comes out is of the same kind.
 
 Poses are 4x4 matrices `T_a_b` that map points of frame b into frame a. Twists are 6-vectors in the
 order (translation, rotation). Formulas: Barfoot, State Estimation for Robotics, ch. 7; the small-angle
 branches are Taylor series, so that values and gradients stay right at and below 1e-7 rad.
+
+Tensors may have any batch shape and are differentiable. A single pose or twist as a numpy array takes a path
+without torch, forty times as fast, for the loops of the tracker; it may differ in the last bit.
 """
 
 import math
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+
+Array = TypeVar("Array", np.ndarray, Tensor)
 
 SMALL_ANGLE_SQUARED = 1e-6  # rad^2; the fourth-order series below is exact to 1e-16 there
 
@@ -34,8 +40,7 @@ def _exp_coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return a, b, c
 
 
-def se3_exp(twist: Tensor) -> Tensor:  # [..., 6] -> [..., 4, 4]
-    """Return the rigid motion exp(twist)."""
+def _exp_of_tensors(twist: Tensor) -> Tensor:  # [..., 6] -> [..., 4, 4]
     v, w = twist[..., :3], twist[..., 3:]
     W = skew(w)
     W2 = W @ W
@@ -46,8 +51,7 @@ def se3_exp(twist: Tensor) -> Tensor:  # [..., 6] -> [..., 4, 4]
     return from_rotation_translation(rotation, translation)
 
 
-def se3_log(T: Tensor) -> Tensor:  # [..., 4, 4] -> [..., 6]
-    """Return the twist of each rigid motion; rotations by pi have no unique logarithm."""
+def _log_of_tensors(T: Tensor) -> Tensor:  # [..., 4, 4] -> [..., 6]
     R, t = T[..., :3, :3], T[..., :3, 3]
     vee = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
@@ -79,35 +83,20 @@ def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:  # [..., 3, 3], [
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], -2)
 
 
-def inverse(T: Tensor) -> Tensor:  # [..., 4, 4]
-    """Return the inverse rigid motion, from the transposed rotation."""
-    R_t = T[..., :3, :3].transpose(-1, -2)
-    return from_rotation_translation(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
-
-
-def interpolate(T_start: Tensor, T_end: Tensor, fraction: Tensor | float) -> Tensor:
-    """Return T_start exp(fraction log(T_start^-1 T_end)), the geodesic of Eq. 9; extrapolates too."""
-    twist = se3_log(inverse(T_start) @ T_end)
-    u = torch.as_tensor(fraction, dtype=twist.dtype, device=twist.device)
-    return T_start @ se3_exp(u[..., None] * twist if u.ndim else u * twist)
-
-
-def exp_matrix(twist: np.ndarray) -> np.ndarray:  # [6] -> [4, 4]
-    """Return `se3_exp` of one twist, without torch: forty times as fast, for loops over single poses."""
+def _exp_of_twist(twist: np.ndarray) -> np.ndarray:  # [6] -> [4, 4]
     R, V = _rotation_and_jacobian(twist[3:])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, V @ twist[:3]
     return T
 
 
-def log_vector(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6]
-    """Return `se3_log` of one motion, without torch unless it turns by nearly 180 degrees."""
+def _log_of_pose(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6]
     R = T[:3, :3]
     axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = math.sqrt(float(axis @ axis))
     angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1))
     if angle > 3:
-        return se3_log(torch.from_numpy(T)).numpy()
+        return _log_of_tensors(torch.from_numpy(T)).numpy()  # near 180 degrees the sine says little
     w = axis * (angle / sine if sine > SMALL_ANGLE_SQUARED else 1.0)
     return np.concatenate([np.linalg.solve(_rotation_and_jacobian(w)[1], T[:3, 3]), w])
 
@@ -129,12 +118,66 @@ def _rotation_and_jacobian(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [
     return np.eye(3) + (a * W + b * W2), np.eye(3) + (b * W + c * W2)
 
 
-def rigid_inverse(T: np.ndarray) -> np.ndarray:  # [4, 4]
-    """Return `inverse` of one motion, without torch."""
-    result = np.eye(4)
-    result[:3, :3] = T[:3, :3].T
-    result[:3, 3] = -(T[:3, :3].T @ T[:3, 3])
+def se3_exp(twist: Array) -> Array:  # [..., 6] -> [..., 4, 4]
+    """Return the rigid motion exp(twist)."""
+    if isinstance(twist, Tensor):
+        return _exp_of_tensors(twist)
+    return _exp_of_twist(twist) if twist.ndim == 1 else _exp_of_tensors(torch.from_numpy(twist)).numpy()
+
+
+def se3_log(T: Array) -> Array:  # [..., 4, 4] -> [..., 6]
+    """Return the twist of each rigid motion; rotations by pi have no unique logarithm."""
+    if isinstance(T, Tensor):
+        return _log_of_tensors(T)
+    return _log_of_pose(T) if T.ndim == 2 else _log_of_tensors(torch.from_numpy(T)).numpy()
+
+
+def inverse(T: Array) -> Array:  # [..., 4, 4]
+    """Return the inverse rigid motion, from the transposed rotation."""
+    if isinstance(T, Tensor):
+        R_t = T[..., :3, :3].transpose(-1, -2)
+        return from_rotation_translation(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
+    if T.ndim == 2:
+        single = np.eye(4)
+        single[:3, :3] = T[:3, :3].T
+        single[:3, 3] = -(T[:3, :3].T @ T[:3, 3])
+        return single
+    result = np.tile(np.eye(4), (*T.shape[:-2], 1, 1))
+    result[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
+    result[..., :3, 3:] = -(result[..., :3, :3] @ T[..., :3, 3:])
     return result
+
+
+def interpolate(T_start: Array, T_end: Array, fraction: "Array | float") -> Array:  # [..., 4, 4], [...]
+    """Return T_start exp(fraction log(T_start^-1 T_end)), the geodesic of Eq. 9; extrapolates too."""
+    twist = se3_log(inverse(T_start) @ T_end)
+    if not isinstance(fraction, int | float) and fraction.ndim:
+        fraction = fraction[..., None]
+    return T_start @ se3_exp(fraction * twist)
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]
+    """Return Ad(T) for twists (translation, rotation): T exp(xi) = exp(Ad(T) xi) T."""
+    R, (x, y, z) = T[:3, :3], T[:3, 3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    return result
+
+
+def transformed(T: np.ndarray, points: np.ndarray) -> np.ndarray:  # [4, 4], [..., 3] -> [..., 3]
+    """Return points of frame b in frame a, T = T_a_b."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def quaternion_product(a: Tensor, b: Tensor) -> Tensor:  # [..., 4] wxyz each
+    """Return the quaternion of turning by b, and then by a."""
+    (w, x, y, z), (p, q, r, s) = a.unbind(-1), b.unbind(-1)
+    product = (
+        *(w * p - x * q - y * r - z * s, w * q + x * p + y * s - z * r),
+        *(w * r - x * s + y * p + z * q, w * s + x * r - y * q + z * p),
+    )
+    return torch.stack(product, -1)
 
 
 def orthonormalized(T: np.ndarray) -> np.ndarray:  # [4, 4]

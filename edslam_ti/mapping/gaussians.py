@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from edslam_ti.config import MappingConfig
+from edslam_ti.geometry import quaternion_product
 
 # Raw parameters and their widths; the names carry the parametrisation.
 PARAMETERS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 0, "logit_colors": 1}
@@ -179,12 +180,7 @@ class GaussianMap:
         T, q = torch.from_numpy(of_frames).float()[at], torch.from_numpy(turns).float()[at]
         means = self._raw["means"][chosen]
         self._raw["means"][chosen] = (T[:, :3, :3] @ means[..., None])[..., 0] + T[:, :3, 3]
-        (w, x, y, z), (a, b, c, d) = q.unbind(-1), self._raw["quats"][chosen].unbind(-1)
-        turned = (
-            *(w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c),
-            *(w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a),
-        )  # the turn's quaternion times the Gaussian's
-        self._raw["quats"][chosen] = torch.stack(turned, -1)
+        self._raw["quats"][chosen] = quaternion_product(q, self._raw["quats"][chosen])
 
     def set_colors(self, colors: Tensor) -> None:  # [N, 1] in (0, 1)
         """Overwrite every Gaussian's brightness; the cells keep theirs."""

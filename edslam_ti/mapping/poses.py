@@ -12,7 +12,7 @@ import numpy as np
 from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, linearised, residual_model
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
-from edslam_ti.geometry import exp_matrix, is_near, log_vector
+from edslam_ti.geometry import is_near, se3_exp, se3_log
 from edslam_ti.kernels.patch_warp import Patches
 
 OPAQUE = 0.9  # alpha from which a pixel of the map's view is a surface
@@ -48,4 +48,4 @@ class MapAligner:
         linearise = linearised(points, self._model, [image.astype(np.float32), no_depth], self._camera)
         T_view_camera, system = levenberg_marquardt(linearise, np.eye(4), STEPS)
         is_good = is_observed(system) and is_near(T_view_camera, *FARTHEST)
-        return T_world_camera @ exp_matrix(SHARE * log_vector(T_view_camera)) if is_good else T_world_camera
+        return T_world_camera @ se3_exp(SHARE * se3_log(T_view_camera)) if is_good else T_world_camera

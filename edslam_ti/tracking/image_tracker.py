@@ -13,7 +13,7 @@ from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.solve import BrightnessChange
 from edslam_ti.frame import Frame
-from edslam_ti.geometry import exp_matrix, is_near, log_vector, rigid_inverse
+from edslam_ti.geometry import inverse, is_near, se3_exp, se3_log
 from edslam_ti.kernels.patch_warp import NormalEquations
 from edslam_ti.tracking.keyframes import Aligned, BrightnessKeyframe, Depth, KeyframeAligner, Moment
 from edslam_ti.tracking.motion_prior import MeasuredPose, MotionPrior
@@ -119,7 +119,7 @@ class BrightnessTracker:
         if self._keyframe is None:
             self._begin_stretch(len(self._path.trajectory))
             return ""
-        T_now_before = rigid_inverse(guess) @ self._path.pose(len(self._path.trajectory) - 1)
+        T_now_before = inverse(guess) @ self._path.pose(len(self._path.trajectory) - 1)
         flow = self._aligner.flow(self._keyframe.depth.small, T_now_before)
         if flow < SILENT_FLOW or before < SLOWING_SHARE * usual:
             return ""  # the camera has stopped: its image stays as it is
@@ -145,7 +145,7 @@ class BrightnessTracker:
             return TrackingResult(guess, False, 0.0, "too few events, and no depth to align instead")
         old = self._aligner.with_points(self._old_keyframes[-1])
         T_world_old = self._path.pose(old.index)
-        T, system = self._aligner.align_depth(old, moment.depth, rigid_inverse(T_world_old) @ guess)
+        T, system = self._aligner.align_depth(old, moment.depth, inverse(T_world_old) @ guess)
         if system.num_depth < MIN_PIXELS:
             return TrackingResult(guess, False, 0.0, "too few events, and depth does not overlap")
         return TrackingResult(T_world_old @ T, True, 0.5 * system.num_depth / system.num_usable)
@@ -160,7 +160,7 @@ class BrightnessTracker:
         middle = self._moments[len(self._moments) // 2].index
         moment = min(with_depth, key=lambda m: abs(m.index - middle))
         assert moment.depth is not None
-        T_now_then = rigid_inverse(self._path.newest) @ self._path.pose(moment.index)
+        T_now_then = inverse(self._path.newest) @ self._path.pose(moment.index)
         if self._aligner.flow(moment.depth.small, T_now_then) < MIN_FLOW:
             return False
         self._keyframe = self._new_keyframe(moment, np.zeros_like(moment.depth.small))
@@ -199,7 +199,7 @@ class BrightnessTracker:
         """Align a moment to the keyframe, with this depth; `start` is a T_world_camera."""
         keyframe = self._keyframe
         assert keyframe is not None
-        T_keyframe_world = rigid_inverse(self._path.pose(keyframe.index))
+        T_keyframe_world = inverse(self._path.pose(keyframe.index))
         return self._aligner.align(keyframe, keyframe.image_at(moment), depth, T_keyframe_world @ start)
 
     def _judged(self, aligned: Aligned, guess: np.ndarray) -> TrackingResult:
@@ -247,12 +247,12 @@ class BrightnessTracker:
             return
         poses, systems = zip(*by_brightness)
         known = [self._path.pose(m.index) for m in (frames[0], frames[-1])]
-        start, end = (log_vector(rigid_inverse(poses[k]) @ T) for k, T in zip((0, -1), known))
+        start, end = (se3_log(inverse(poses[k]) @ T) for k, T in zip((0, -1), known))
         self._learn_motion([(start, systems[0].H), (end, systems[-1].H)])
         measured = [MeasuredPose(frames[0].index, frames[0].timestamp, known[0], None)]
         for m, T, system in zip(frames[1:-1], poses[1:-1], systems[1:-1]):
             share = (m.timestamp - frames[0].timestamp) / (moment.timestamp - frames[0].timestamp)
-            corrected = T @ exp_matrix((1 - share) * start + share * end)
+            corrected = T @ se3_exp((1 - share) * start + share * end)
             # Errors of neighbouring frames are alike: together they count as one.
             information = system.H / (self._motion.error * (len(frames) - 2))
             measured.append(MeasuredPose(m.index, m.timestamp, corrected, information))
@@ -306,7 +306,7 @@ class BrightnessTracker:
         keyframe = self._keyframe
         assert keyframe is not None
         T_world_keyframe, moments = self._path.pose(keyframe.index), self._spread(keyframe)
-        poses = [rigid_inverse(self._path.pose(m.index)) @ T_world_keyframe for m in moments]
+        poses = [inverse(self._path.pose(m.index)) @ T_world_keyframe for m in moments]
         self._aligner.solve(keyframe, moments, poses, iterations, is_robust)
 
     def _spread(self, keyframe: BrightnessKeyframe) -> list[Moment]:
@@ -337,8 +337,7 @@ class BrightnessTracker:
         T_now = self._path.pose(keyframe.index)
         old_enough = [k for k in self._old_keyframes if keyframe.index - k.index >= 2 * WINDOW]
         shares = [
-            self._aligner.share_in_view(k, rigid_inverse(self._path.pose(k.index)) @ T_now)
-            for k in old_enough
+            self._aligner.share_in_view(k, inverse(self._path.pose(k.index)) @ T_now) for k in old_enough
         ]
         in_view = [k for k, share in zip(old_enough, shares) if share >= REVISIT_OVERLAP]
         for old in in_view[:MAX_REVISITS]:  # the oldest has drifted least
@@ -346,10 +345,10 @@ class BrightnessTracker:
             if T is None:
                 continue
             keyframe.is_new_place = max(shares) < self._config.min_overlap
-            drift = rigid_inverse(T_now) @ T
+            drift = inverse(T_now) @ T
             if not is_near(drift, *MAX_DRIFT):
                 continue
-            T_old_new = rigid_inverse(self._path.pose(old.index)) @ T
+            T_old_new = inverse(self._path.pose(old.index)) @ T
             self._revisits.append(Revisit(old.index, keyframe.index, T_old_new))
             if not is_near(drift, *NO_DRIFT):
                 self._correct()
@@ -378,7 +377,7 @@ class BrightnessTracker:
     ) -> np.ndarray | None:
         """Return the new keyframe's pose by alignment to an older one, or None where they do not match."""
         old, T_world_old = self._aligner.with_points(old), self._path.pose(old.index)
-        T = rigid_inverse(T_world_old) @ start
+        T = inverse(T_world_old) @ start
         for _ in range(2):  # images are known up to an offset
             difference = self._aligner.difference(old, new.log_brightness, T)
             if len(difference) < MIN_PIXELS // 4:
@@ -408,23 +407,23 @@ class BrightnessTracker:
         keyframe = self._keyframe
         assert keyframe is not None
         first, last = self._silent_since - 1, self._stretch_start  # the last frame before, the first after
-        correction = T_world_camera @ rigid_inverse(self._path.pose(keyframe.index))
+        correction = T_world_camera @ inverse(self._path.pose(keyframe.index))
         for index in range(last, len(self._path)):
             self._path.replace(index, correction @ self._path.pose(index))
         if is_near(correction, *COASTED) or first < 1:
-            twist = log_vector(correction)
+            twist = se3_log(correction)
             for index in range(first + 1, last):
                 share = (index - first) / (last - first)
-                self._path.replace(index, exp_matrix(share * twist) @ self._path.pose(index))
+                self._path.replace(index, se3_exp(share * twist) @ self._path.pose(index))
             return
         start, n = self._path.pose(first), last - first
-        across = log_vector(rigid_inverse(start) @ self._path.pose(last))
-        before = n * log_vector(rigid_inverse(self._path.pose(first - 1)) @ start)
-        after = n * log_vector(rigid_inverse(self._path.pose(last)) @ self._path.pose(last + 1))
+        across = se3_log(inverse(start) @ self._path.pose(last))
+        before = n * se3_log(inverse(self._path.pose(first - 1)) @ start)
+        after = n * se3_log(inverse(self._path.pose(last)) @ self._path.pose(last + 1))
         for index in range(first + 1, last):
             u = (index - first) / n
             twist = u * (1 - u) ** 2 * before + u**2 * (3 - 2 * u) * across - u**2 * (1 - u) * after
-            self._path.replace(index, start @ exp_matrix(twist))
+            self._path.replace(index, start @ se3_exp(twist))
 
 
 class _Path:

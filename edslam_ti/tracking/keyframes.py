@@ -16,7 +16,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.event_images.solve import Observation, compile_kernels, solve_log_brightness_image
 from edslam_ti.frame import Frame, downscaled, downscaled_depth
-from edslam_ti.geometry import exp_matrix, orthonormalized, rigid_inverse
+from edslam_ti.geometry import inverse, orthonormalized, se3_exp
 from edslam_ti.kernels import depth_average
 from edslam_ti.kernels.depth_average import DepthAgreement, PixelRays, average_depth
 from edslam_ti.kernels.patch_warp import NormalEquations, Patches
@@ -218,7 +218,7 @@ class KeyframeAligner:
                 keyframe.depth_points, self._depth_only, [nothing, depth.full], self._camera
             )
             both = brightness(T) + geometry(T)
-            T = T @ exp_matrix(-np.linalg.solve(both.H, both.g))  # Gauss-Newton: the minimum is near
+            T = T @ se3_exp(-np.linalg.solve(both.H, both.g))  # Gauss-Newton: the minimum is near
         T = orthonormalized(T)
         difference = self.difference(keyframe, image, T)
         misfit = float(np.median(np.abs(difference))) if len(difference) else np.inf
@@ -241,7 +241,7 @@ class KeyframeAligner:
         self, keyframe: BrightnessKeyframe, image: np.ndarray, T_keyframe_camera: np.ndarray
     ) -> np.ndarray:
         """Return an image less a keyframe's, at pixels of the keyframe in view (nearest neighbours)."""
-        x, y, u, v = self._warped(keyframe.depth.small, rigid_inverse(T_keyframe_camera))
+        x, y, u, v = self._warped(keyframe.depth.small, inverse(T_keyframe_camera))
         column, row = np.rint(x).astype(int), np.rint(y).astype(int)
         height, width = image.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -254,7 +254,7 @@ class KeyframeAligner:
 
     def share_in_view(self, keyframe: BrightnessKeyframe, T_keyframe_camera: np.ndarray) -> float:
         """Return the share of a keyframe's pixels with depth that are in view, hidden ones included."""
-        x, y, _, _ = self._warped(keyframe.depth.small, rigid_inverse(T_keyframe_camera))
+        x, y, _, _ = self._warped(keyframe.depth.small, inverse(T_keyframe_camera))
         inside = (x >= 0) & (x < self.camera.width) & (y >= 0) & (y < self.camera.height)
         return float(inside.sum() / max(np.count_nonzero(keyframe.depth.small[::2, ::2]), 1))
 

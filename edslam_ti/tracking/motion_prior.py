@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edslam_ti.geometry import exp_matrix, log_vector, rigid_inverse
-from edslam_ti.kernels.patch_warp import adjoint
+from edslam_ti.geometry import adjoint, inverse, se3_exp, se3_log
 
 REMEMBERED = 20  # observations that q and the size of errors are averaged over
 
@@ -68,7 +67,7 @@ class MotionPrior:
                 H[k, :, k] += m.information
         for k in range(1, n - 1):
             weight = 2 / (q * (d[k - 1] + d[k]))
-            back = [adjoint(rigid_inverse(poses[j + 1]) @ poses[j]) for j in (k - 1, k)]
+            back = [adjoint(inverse(poses[j + 1]) @ poses[j]) for j in (k - 1, k)]
             J = {
                 k - 1: back[0] / d[k - 1],
                 k: -np.eye(6) / d[k - 1] - back[1] / d[k],
@@ -81,10 +80,10 @@ class MotionPrior:
         free = [k for k, m in enumerate(measured) if m.information is not None]
         system = H[free][:, :, free].reshape(6 * len(free), -1)
         for k, twist in zip(free, -np.linalg.solve(system, g[free].ravel()).reshape(-1, 6)):
-            poses[k] = poses[k] @ exp_matrix(twist)
+            poses[k] = poses[k] @ se3_exp(twist)
         return poses
 
 
 def _velocities(timestamps: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:  # [N - 1, 6]
-    moved = [log_vector(rigid_inverse(a) @ b) for a, b in itertools.pairwise(poses)]
+    moved = [se3_log(inverse(a) @ b) for a, b in itertools.pairwise(poses)]
     return np.array(moved) / np.diff(timestamps)[:, None]

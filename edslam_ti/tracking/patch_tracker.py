@@ -9,12 +9,11 @@ from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, re
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
 from edslam_ti.frame import Frame
-from edslam_ti.geometry import orthonormalized, rigid_inverse
+from edslam_ti.geometry import adjoint, inverse, orthonormalized
 from edslam_ti.kernels.patch_warp import (
     Alignment,
     Direction,
     NormalEquations,
-    adjoint,
     compile_kernels,
     extract_patches,
 )
@@ -52,8 +51,8 @@ class _Problem:
         # T_reference_camera exp(xi) = exp(Ad(T_reference_camera) xi) T_reference_camera.
         poses, unknowns = [], []
         for T_world_reference in self.references:
-            T_reference_camera = rigid_inverse(T_world_reference) @ T_world_camera
-            poses.append(rigid_inverse(T_reference_camera))
+            T_reference_camera = inverse(T_world_reference) @ T_world_camera
+            poses.append(inverse(T_reference_camera))
             unknowns.append(-np.eye(6))
             if self.is_bidirectional:
                 poses.append(T_reference_camera)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
-from edslam_ti.geometry import rigid_inverse
+from edslam_ti.geometry import inverse
 from edslam_ti.tracking.keyframes import BrightnessKeyframe
 
 MIN_MATCHES = 15  # features that must agree for a keyframe to be recognised
@@ -38,7 +38,7 @@ def recognised(
         return None
     T_new_old = np.eye(4)
     T_new_old[:3, :3], T_new_old[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return rigid_inverse(T_new_old)
+    return inverse(T_new_old)
 
 
 def _as_picture(log_brightness: np.ndarray) -> np.ndarray:  # [h, w] uint8

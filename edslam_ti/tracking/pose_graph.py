@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edslam_ti.geometry import exp_matrix, log_vector, orthonormalized, rigid_inverse
+from edslam_ti.geometry import inverse, orthonormalized, se3_exp, se3_log
 from edslam_ti.open3d_loader import load_open3d
 
 # Standard deviations in metres and radians: of the motion over one frame, which adds up, and of a revisit.
@@ -44,7 +44,7 @@ def corrections(
         graph.edges.append(edge)
 
     for k in range(len(nodes) - 1):
-        T_a_b = rigid_inverse(poses[k]) @ poses[k + 1]
+        T_a_b = inverse(poses[k]) @ poses[k + 1]
         connect(k, k + 1, T_a_b, DRIFT, nodes[k + 1] - nodes[k])
     place = {frame: k for k, frame in enumerate(nodes)}
     for revisit in revisits:
@@ -55,7 +55,7 @@ def corrections(
         registration.GlobalOptimizationConvergenceCriteria(),
         registration.GlobalOptimizationOption(reference_node=0),
     )
-    return [orthonormalized(np.asarray(node.pose) @ rigid_inverse(T)) for node, T in zip(graph.nodes, poses)]
+    return [orthonormalized(np.asarray(node.pose) @ inverse(T)) for node, T in zip(graph.nodes, poses)]
 
 
 def spread(
@@ -68,5 +68,5 @@ def spread(
     if k < 0 or k >= len(nodes) - 1:
         return corrections[max(k, 0)]
     share = (frame - nodes[k]) / (nodes[k + 1] - nodes[k])
-    change = rigid_inverse(corrections[k]) @ corrections[k + 1]
-    return np.asarray(corrections[k] @ exp_matrix(share * log_vector(change)))
+    change = inverse(corrections[k]) @ corrections[k + 1]
+    return np.asarray(corrections[k] @ se3_exp(share * se3_log(change)))

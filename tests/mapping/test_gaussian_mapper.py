@@ -12,7 +12,7 @@ from sequences import make_slam, settings
 
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.evaluation.images import depth_l1_cm, evaluate_images
-from edslam_ti.geometry import exp_matrix
+from edslam_ti.geometry import se3_exp
 from edslam_ti.mapping.gaussian_mapper import (
     GaussianMapper,
     PoseRefiner,
@@ -153,7 +153,7 @@ def test_view_of_what_may_show_is_that_of_the_whole_map(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     slam, mapper = mapped(tiny_sequence, tiny_samples[:2], iterations=0, finish=False)
-    T = slam.trajectory.pose(0) @ exp_matrix(np.array([0.1, 0.0, -0.2, 0.1, 0.4, 0.0]))
+    T = slam.trajectory.pose(0) @ se3_exp(np.array([0.1, 0.0, -0.2, 0.1, 0.4, 0.0]))
     with torch.no_grad():
         whole = render(mapper.gaussians.activated(), mapper._camera, torch.from_numpy(T), 0.5)
     part = mapper._render(T)
@@ -216,9 +216,7 @@ def test_map_follows_when_a_revisit_corrects_the_path(
     def depth_error(share: float = 1.0) -> float:
         """Return the depth L1 (cm) of a map whose path, drifted, was corrected before its last frame."""
         *before, last = tiny_samples
-        poses = {
-            s.timestamp: T @ exp_matrix(share * k * drift) for k, (s, T) in enumerate(zip(before, truth))
-        }
+        poses = {s.timestamp: T @ se3_exp(share * k * drift) for k, (s, T) in enumerate(zip(before, truth))}
         slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW))
         slam.tracker = TruePoses(poses.get)
         for sample in before:
@@ -331,7 +329,7 @@ def test_frames_without_depth_come_half_way_to_where_the_map_looks_like_their_im
 ) -> None:
     sparse = [replace(s, depth=s.depth if k % 3 == 0 else None) for k, s in enumerate(tiny_samples)]
     slam, mapper = mapped(tiny_sequence, sparse, final_iterations=30)
-    shift = exp_matrix(np.array([0.004, 0.003, 0, 0, 0, 0]))
+    shift = se3_exp(np.array([0.004, 0.003, 0, 0, 0, 0]))
     true = slam.trajectory.poses
     for k in range(1, len(sparse)):
         slam.trajectory.replace(k, true[k] @ shift)

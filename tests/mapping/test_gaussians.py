@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from edslam_ti.config import MappingConfig
-from edslam_ti.geometry import exp_matrix
+from edslam_ti.geometry import se3_exp
 from edslam_ti.mapping.gaussians import PARAMETERS, GaussianMap
 
 CONFIG = MappingConfig()
@@ -145,7 +145,7 @@ def test_gaussians_follow_the_frame_they_are_from() -> None:
             torch.full((1, 1), 0.5),
             frame,
         )
-    quarter = exp_matrix(np.array([0, 0, 0, 0, 0, np.pi / 2]))  # about z
+    quarter = se3_exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))  # about z
     quarter[2, 3] = 0.5
     gaussians.follow({8: quarter, 99: quarter})
     expected = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.5]])

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import least_squares
 
-from edslam_ti.geometry import exp_matrix, log_vector, rigid_inverse
+from edslam_ti.geometry import inverse, se3_exp, se3_log
 from edslam_ti.tracking.motion_prior import MeasuredPose, MotionPrior
 
 TIMES = np.array([0.0, 0.05, 0.1, 0.14, 0.2, 0.25, 0.3])
@@ -12,13 +12,13 @@ VELOCITY = np.array([0.4, -0.1, 0.2, 0.3, 0.5, -0.2])  # metres and radians per 
 
 def path() -> list[np.ndarray]:  # N times [4, 4]
     """Return poses along a screw: constant velocity of the body."""
-    return [exp_matrix(t * VELOCITY) for t in TIMES]
+    return [se3_exp(t * VELOCITY) for t in TIMES]
 
 
 def informed(sigma: float = 0.002) -> MotionPrior:
     prior = MotionPrior()
     random = np.random.default_rng(0)
-    bent = [T @ exp_matrix(random.normal(0, 2e-4, 6)) for T in path()]
+    bent = [T @ se3_exp(random.normal(0, 2e-4, 6)) for T in path()]
     prior.learn_motion(TIMES, bent)
     prior.learn_error(np.full(6, sigma), np.eye(6) / sigma**2)
     return prior
@@ -32,7 +32,7 @@ def measured(noise: float) -> list[MeasuredPose]:
         if k in (0, 1, len(TIMES) - 1):
             result.append(MeasuredPose(k, t, T, None))
         else:
-            noisy = T @ exp_matrix(random.normal(0, noise, 6))
+            noisy = T @ se3_exp(random.normal(0, noise, 6))
             result.append(MeasuredPose(k, t, noisy, np.eye(6) / noise**2))
     return result
 
@@ -44,7 +44,7 @@ def test_noise_shrinks_and_exact_poses_stay() -> None:
         assert np.array_equal(after[k], poses[k].T_world_camera)
 
     def rms(candidates: list[np.ndarray]) -> float:
-        errors = [log_vector(rigid_inverse(T) @ c) for T, c in zip(path(), candidates)]
+        errors = [se3_log(inverse(T) @ c) for T, c in zip(path(), candidates)]
         return float(np.sqrt(np.mean(np.square(errors))))
 
     assert rms(after) < 0.5 * rms([m.T_world_camera for m in poses])
@@ -58,9 +58,9 @@ def test_smoothed_poses_are_the_minimum_of_the_cost() -> None:
     def residuals(unknown: np.ndarray) -> np.ndarray:
         T = [m.T_world_camera for m in poses]
         for k, twist in zip(free, unknown.reshape(-1, 6)):
-            T[k] = T[k] @ exp_matrix(twist)
+            T[k] = T[k] @ se3_exp(twist)
         d = np.diff(TIMES)
-        v = np.array([log_vector(rigid_inverse(T[k]) @ T[k + 1]) / d[k] for k in range(len(d))])
+        v = np.array([se3_log(inverse(T[k]) @ T[k + 1]) / d[k] for k in range(len(d))])
         change = np.diff(v, axis=0) / np.sqrt(q * (d[:-1] + d[1:])[:, None] / 2)
         return np.concatenate([unknown / 0.002, change.ravel()])
 
@@ -68,7 +68,7 @@ def test_smoothed_poses_are_the_minimum_of_the_cost() -> None:
     assert np.abs(best).max() > 1e-3
     for k, twist, T in zip(free, best, [prior.smoothed(poses)[k] for k in free]):
         np.testing.assert_allclose(
-            T, poses[k].T_world_camera @ exp_matrix(twist), atol=1e-4
+            T, poses[k].T_world_camera @ se3_exp(twist), atol=1e-4
         )  # of 4e-3: one step
 
 
@@ -78,7 +78,7 @@ def test_quickness_of_the_motion_is_learned() -> None:
     velocity, T, poses = np.zeros(6), np.eye(4), [np.eye(4)]
     for k in range(40 * 60):
         velocity = velocity + random.normal(0, np.sqrt(q * step))
-        T = T @ exp_matrix(step * velocity)
+        T = T @ se3_exp(step * velocity)
         if k % 40 == 39:
             poses.append(T)
     means = []
