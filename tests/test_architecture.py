@@ -35,8 +35,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "event_images": ["solve", "start_image", "contrast", "sharp"],
     "tracking": [
-        *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "place_recognition"),
-        *("pose_graph", "image_tracker"),
+        *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "smoothing", "gaps"),
+        *("place_recognition", "pose_graph", "loop_closure", "image_tracker"),
     ],
     "mapping": [
         *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
