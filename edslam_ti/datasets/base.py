@@ -1,5 +1,6 @@
 """What every sequence offers, and how it is cut into samples."""
 
+import inspect
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -87,6 +88,36 @@ class EventDepthSequence(ABC):
         if self.truth is None or not self.truth.covers(timestamp):
             return None
         return self.truth.at(timestamp)
+
+
+class WrappedSequence(EventDepthSequence):
+    """A sequence that shows another one; subclasses override what they change.
+
+    Every attribute of `EventDepthSequence` is taken over when the wrapper is made, so that none can be
+    forgotten when one is added. Methods pass the call on. `image_at` and `true_pose` do not: they follow
+    from what the wrapper itself shows.
+    """
+
+    def __init__(self, sequence: EventDepthSequence) -> None:
+        self._sequence = sequence
+        for name in inspect.get_annotations(EventDepthSequence):
+            setattr(self, name, getattr(sequence, name))
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        return self._sequence.time_range
+
+    def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+        return self._sequence.depth(index)
+
+    def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
+        return self._sequence.image(index)
+
+    def events(self, start: float, end: float) -> Events:
+        return self._sequence.events(start, end)
+
+    def novel_views(self) -> list[NovelView]:
+        return self._sequence.novel_views()
 
 
 MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface shows something
