@@ -116,9 +116,7 @@ class EventReplicaSequence(EventDepthSequence):
 
     dataset = "event_replica"
 
-    def __init__(
-        self, folder: Path, contrast_threshold: float | None = None, description: str | None = None
-    ) -> None:
+    def __init__(self, folder: Path, contrast_threshold: float | None = None) -> None:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
@@ -126,7 +124,7 @@ class EventReplicaSequence(EventDepthSequence):
         surfaces = folder / "surfaces.ply"
         self.surfaces_file = surfaces if surfaces.is_file() else None
         calibration = read_camera(folder / "camera.json")
-        self.description = description or calibration.description or f"EventReplica layout, {folder}"
+        self.description = calibration.description or f"EventReplica layout, {folder}"
         self.camera = calibration.camera
         self.exposure = calibration.exposure
         self._metres_per_unit = calibration.metres_per_unit
