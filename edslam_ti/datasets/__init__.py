@@ -20,6 +20,7 @@ from typing import NamedTuple
 from edslam_ti.config import Config
 from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence, WrappedSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
+from edslam_ti.datasets.rgbd import RgbdSequence, is_rgbd
 from edslam_ti.datasets.rpg import RpgSequence, is_rpg
 from edslam_ti.errors import ConfigError
 
@@ -84,6 +85,11 @@ FORMATS: dict[str, Format] = {
         "RPG Event Camera Dataset's layout, with events.txt",
         lambda folder, config: RpgSequence(folder),
         is_rpg,
+    ),
+    "rgbd": Format(
+        "layouts of TUM RGB-D, of NICE-SLAM's Replica and of 7-Scenes, without events",
+        lambda folder, config: RgbdSequence(folder),
+        is_rgbd,
     ),
     "builtin": Format(
         "simulated rooms, made on first use",

@@ -61,6 +61,8 @@ class CameraFile(BaseModel):
     """Units of depth/*.png in a metre (1000: millimetres); below 1, metres in a unit (0.001: the same)."""
     exposure: float | None = Field(None, ge=0, lt=1)
     """Seconds over which an image integrates, centred on its time; 0: sharp."""
+    frame_rate: float = Field(30.0, gt=0)
+    """Images a second, for layouts whose files carry a number but no time (not EventReplica's)."""
     description: str | None = None
     """What the recording is; simulated ones say so here, and results repeat it."""
 

@@ -37,6 +37,7 @@ from edslam_ti.datasets.files import (
     read_depth,
     read_image,
     read_numbers,
+    read_timed_paths,
 )
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
@@ -62,7 +63,7 @@ class RpgSequence(EventDepthSequence):
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
         K = read_numbers(folder / "calib.txt", 9, "fx fy cx cy k1 k2 p1 p2 k3")[0]
-        image_times, image_files = _read_image_list(folder)
+        image_times, image_files = read_timed_paths(folder / "images.txt", "which also give depth its times")
         depth, depth_folder = _depth_files(folder, len(image_times))
         width, height = image_size(image_files[0]) if image_files else image_size(next(iter(depth.values())))
         self.camera = Camera(width, height, *(float(v) for v in K[:4]))
@@ -141,30 +142,6 @@ class _EventUndistortion:
         rank = np.arange(len(event)) - np.repeat(np.cumsum(number) - number, number)
         y, x = np.divmod(self._targets[first[event] + rank], self._width)
         return Events(x.astype(np.int16), y.astype(np.int16), events.t[event], events.polarity[event])
-
-
-def _read_image_list(folder: Path) -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
-    """Read images.txt."""
-    path = folder / "images.txt"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; expected lines 't path', which also give depth its times")
-    times: list[float] = []
-    files: list[Path] = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            time, name = float(fields[0]), fields[1]
-        except (ValueError, IndexError) as error:
-            raise DataError(f"{path}: line {number}: expected 't path', got '{line}'") from error
-        if not np.isfinite(time) or (times and time <= times[-1]):
-            raise DataError(f"{path}: line {number}: expected increasing times in seconds, got {time}")
-        times.append(time)
-        files.append(folder / name)
-    if not files:
-        raise DataError(f"{path}: expected lines 't path', got an empty file")
-    return np.array(times), files
 
 
 def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:
