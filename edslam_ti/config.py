@@ -221,7 +221,7 @@ class Config(Stage):
 
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
-    dataset: Literal["event_replica", "rpg", "builtin"] | None = None
+    dataset: str | None = None
     """Input format; omitted: EventReplica when found under the data folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""

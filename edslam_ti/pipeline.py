@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from edslam_ti import kernels
 from edslam_ti.config import Config
-from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
+from edslam_ti.datasets import EventDepthSequence, SampledSequence, find_sequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
 from edslam_ti.evaluation.images import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
@@ -66,7 +66,7 @@ def run(config: Config, console: Console | None = None) -> Path:
 
 
 def _prepare(config: Config) -> Run:
-    sequence = open_sequence(config)
+    sequence = open_recording(config)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     contrast = contrast_of(config, sequence, samples)
     return Run(
@@ -77,6 +77,17 @@ def _prepare(config: Config) -> Run:
         held_out_frames(samples, config.evaluation.hold_out_every),
         contrast,
     )
+
+
+def open_recording(config: Config) -> EventDepthSequence:
+    """Open the scene that the settings name; without --dataset, print which one that turned out to be."""
+    if config.dataset is None:
+        folder = find_sequence(config).folder
+        where = (
+            f"the recording in {folder}" if folder else f"none in {config.data_dir}, so the built-in stand-in"
+        )
+        print(f"scene {config.scene}: {where}", flush=True)
+    return open_sequence(config)
 
 
 def make_slam(

@@ -20,7 +20,7 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
-from edslam_ti.output import atomic_folder
+from edslam_ti.output import atomic_folder, write_npy_header
 from edslam_ti.simulation.depth_noise import kinect_depth
 from edslam_ti.simulation.paths import CameraPath
 from edslam_ti.simulation.renderer import Render, Renderer
@@ -29,7 +29,6 @@ from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_truth
 
 MILLISECOND = 1_000_000  # nanoseconds
-HEADER_BYTES = 128  # of the event file
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ class EventFileWriter:
         self.count = 0
         self._dtype = np.dtype(dtype)
         self._file = path.open("wb")
-        self._file.write(b"\0" * HEADER_BYTES)
+        write_npy_header(self._file, self._dtype, 0, 4)
 
     def append(self, events: EventArrays) -> None:
         """Write events as rows x, y, t (s), polarity."""
@@ -205,10 +204,7 @@ class EventFileWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        text = f"{{'descr': '{self._dtype.str}', 'fortran_order': False, 'shape': ({self.count}, 4), }}"
-        prefix = np.lib.format.magic(1, 0) + (HEADER_BYTES - 10).to_bytes(2, "little")
-        self._file.seek(0)
-        self._file.write(prefix + text.ljust(HEADER_BYTES - 11).encode("latin1") + b"\n")
+        write_npy_header(self._file, self._dtype, self.count, 4)
         self._file.close()
 
 
