@@ -15,7 +15,7 @@ from edslam_ti import kernels
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation.images import ate_rmse_cm
+from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping.mapper import Mapper

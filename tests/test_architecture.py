@@ -42,7 +42,7 @@ ORDERS: dict[str, list[str]] = {
         *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
         *("targets", "poses", "gaussian_mapper"),
     ],
-    "evaluation": ["images", "meshes"],
+    "evaluation": ["trajectories", "lpips", "images", "meshes"],
     "results": ["pictures", "export", "plots", "folder"],
     "experiments": [
         *("cases", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times", "steps"),

@@ -23,7 +23,7 @@ from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation import images as evaluation
+from edslam_ti.evaluation import trajectories as evaluation
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.pipeline import held_out_frames, run
 from edslam_ti.results import folder as results

@@ -10,7 +10,7 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation.images import align_views
+from edslam_ti.evaluation.trajectories import align_views
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.trajectory import Trajectory
 

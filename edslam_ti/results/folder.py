@@ -24,14 +24,11 @@ from edslam_ti.evaluation.images import (
     ImageMetrics,
     LinearFit,
     ViewMetrics,
-    align_views,
-    ate_rmse_cm,
     depth_l1_cm,
     evaluate_images,
-    inceventgs_slice,
-    trajectory_errors,
 )
 from edslam_ti.evaluation.meshes import TrueSurfaces, lookouts, mesh_errors, seen_pixels
+from edslam_ti.evaluation.trajectories import align_views, ate_rmse_cm, inceventgs_slice, trajectory_errors
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.geometry import orthonormalized
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper

@@ -12,7 +12,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation.images import trajectory_errors
+from edslam_ti.evaluation.trajectories import trajectory_errors
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.mapping.volume import MeshView
