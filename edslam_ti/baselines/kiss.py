@@ -34,7 +34,7 @@ class KissIcpTracker:
         config.adaptive_threshold.initial_threshold = INITIAL_THRESHOLD
         config.adaptive_threshold.min_motion_th = MIN_MOTION
         self._odometry: Any = KissICP(config)
-        self._rays = camera.rays().reshape(-1, 3)
+        self._camera = camera
         self._T_world_start: np.ndarray | None = None
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
@@ -42,8 +42,7 @@ class KissIcpTracker:
         if frame.depth is None:
             message = "no depth image at this time: pose predicted"
             return TrackingResult(T_world_camera_guess, False, 0.0, message)
-        depth = frame.depth.reshape(-1, 1)
-        points = (self._rays * depth)[depth[:, 0] > 0].astype(np.float64)
+        points = self._camera.back_project(frame.depth)
         self._odometry.register_frame(points, np.zeros(len(points)))
         if self._T_world_start is None:
             self._T_world_start = T_world_camera_guess

@@ -27,7 +27,7 @@ from edslam_ti.evaluation.images import (
     depth_l1_cm,
     evaluate_images,
 )
-from edslam_ti.evaluation.meshes import TrueSurfaces, lookouts, mesh_errors, seen_pixels
+from edslam_ti.evaluation.meshes import TrueSurfaces, mesh_errors, seen_pixels, viewpoints
 from edslam_ti.evaluation.trajectories import align_views, ate_rmse_cm, inceventgs_slice, trajectory_errors
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.geometry import orthonormalized
@@ -302,7 +302,7 @@ def _novel_views(state: Run, mapper: Mapper, most: int) -> Iterator[_RenderedVie
     start, end = trajectory.timestamps[[0, -1]]
     novel = [v for v in state.sequence.novel_views() if start <= v.timestamp <= end]
     camera, surfaces = state.sequence.camera, state.sequence.surfaces_file
-    looks = TrueSurfaces(surfaces).looks(camera, lookouts(truth)) if surfaces else None
+    looks = TrueSurfaces(surfaces).views(camera, viewpoints(truth)) if surfaces else None
     T_estimate_truth = np.linalg.inv(align_views(trajectory.resampled(truth.timestamps).poses, truth.poses))
     for true in (novel[k] for k in _evenly(len(novel), most)):
         view = mapper.render(camera, orthonormalized(T_estimate_truth @ true.T_world_camera))
