@@ -25,9 +25,9 @@ from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation import trajectories as evaluation
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
+from edslam_ti.mapping.gaussian_ply import read_gaussian_ply
 from edslam_ti.pipeline import held_out_frames, run
 from edslam_ti.results import folder as results
-from edslam_ti.results.export import read_gaussian_ply
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import read_tum

@@ -7,6 +7,7 @@ alone: point-to-plane alignment with projective association (Newcombe et al. 201
 parallel: two runs agree to about a micrometre, not to the last digit.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -138,6 +139,22 @@ class TsdfMapper:
         """Return the vertices of the fused surface [N, 3] and their brightness [N]."""
         mesh = self._volume.mesh()
         return np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors).reshape(-1, 3).mean(1)
+
+    @property
+    def map(self) -> TsdfVolume:
+        """The volume."""
+        return self._volume
+
+    def keyframe_indices(self) -> list[int]:
+        """Return nothing: every frame is fused, and none is chosen."""
+        return []
+
+    def metrics(self) -> dict[str, int | float | None]:
+        """Return nothing: the volume has no numbers of its own."""
+        return {}
+
+    def save(self, folder: Path) -> None:
+        """Write nothing: the volume's points and mesh are written for every mapper."""
 
 
 def _rgbd_image(depth: np.ndarray, image: np.ndarray) -> Any:

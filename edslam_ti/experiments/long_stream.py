@@ -14,7 +14,6 @@ from torch import Tensor
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
-from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.output import atomic_file
 from edslam_ti.pipeline import contrast_of, held_out_frames, make_slam
 from edslam_ti.results.pictures import new_figure, save_figure
@@ -61,8 +60,8 @@ def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameC
 def _held_mb(slam: Slam) -> tuple[float, float, float]:
     """Return the MB of the map, of what else the mapper keeps, and of what the tracker keeps."""
     counted: set[int] = set()  # what two of them hold counts for the first
-    gaussians = slam.mapper.gaussians if isinstance(slam.mapper, GaussianMapper) else None
-    held = [held_bytes(part, counted) / 2**20 for part in (gaussians, slam.mapper, slam.tracker)]
+    the_map = None if slam.mapper is None else slam.mapper.map
+    held = [held_bytes(part, counted) / 2**20 for part in (the_map, slam.mapper, slam.tracker)]
     return held[0], held[1], held[2]
 
 
