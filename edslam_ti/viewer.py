@@ -9,6 +9,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import EdSlamError
+from edslam_ti.geometry import inverse
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.trajectory import Trajectory
@@ -17,6 +18,7 @@ PATH_COLOUR, KEYFRAME_COLOUR = "#0072B2", "#D55E00"  # colour-blind safe (Okabe 
 MAP_EVERY = 5  # the window fetches the map points at every n-th frame
 FRUSTUM_EVERY = 10  # frames between the frusta of a map without keyframes
 WIDTH, HEIGHT = 1280, 720  # pixels of the window
+FOCAL = 625.0  # pixels: 60 degrees from top to bottom
 
 
 class Viewer(Protocol):
@@ -76,7 +78,7 @@ class Open3dViewer:
             else:
                 self._window.add_geometry(shape, reset_bounding_box=True)
                 self._shown.append(shape)
-                self._look_along(trajectory.pose(0))
+                self._look_from(trajectory.pose(0))
         self._window.poll_events()
         self._window.update_renderer()
 
@@ -84,11 +86,15 @@ class Open3dViewer:
         """Take the window away."""
         self._window.destroy_window()
 
-    def _look_along(self, T_world_camera: np.ndarray) -> None:
+    def _look_from(self, T_world_camera: np.ndarray) -> None:
+        """Put the eye where a camera stood, looking its way."""
+        parameters = self._o3d.camera.PinholeCameraParameters()
+        centre = ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+        parameters.intrinsic = self._o3d.camera.PinholeCameraIntrinsic(WIDTH, HEIGHT, FOCAL, FOCAL, *centre)
+        parameters.extrinsic = inverse(T_world_camera)
         control = self._window.get_view_control()
-        control.set_front(-T_world_camera[:3, 2])  # from the scene to the eye
-        control.set_up(-T_world_camera[:3, 1])
-        control.set_zoom(0.4)
+        # The size of the window may have been changed by now.
+        control.convert_from_pinhole_camera_parameters(parameters, allow_arbitrary=True)
 
 
 # By name; a viewer is made when a run starts and may raise EdSlamError.

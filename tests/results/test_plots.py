@@ -13,13 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.plots import align_to_truth, draw_results, plot_trajectory
 from edslam_ti.results.reading import load_result
 from edslam_ti.results.window import show_results
 from edslam_ti.trajectory import Trajectory, write_tum
-from edslam_ti.viewer import VIEWERS, fill_cloud, fill_lines, frustum_lines, path_lines
 
 CAMERA = Camera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
 VIEW_APP = Path(__file__).parents[2] / "apps" / "view.py"
@@ -170,36 +168,13 @@ def test_broken_parts_of_a_result_are_named(result_folder: Path, tmp_path: Path,
         load_result(tmp_path)
 
 
-def test_window_without_display_is_a_clear_error(result_folder: Path, monkeypatch) -> None:
+def test_window_of_results_without_display_is_a_clear_error(result_folder: Path, monkeypatch) -> None:
     if not sys.platform.startswith("linux"):
         pytest.skip("displays are announced by the environment on Linux only")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(EdSlamError, match="no display"):
-        VIEWERS["open3d"]()
-    with pytest.raises(EdSlamError, match="no display"):
         show_results([result_folder])
-
-
-def test_frustum_opens_from_the_camera_along_its_view() -> None:
-    T = curve().pose(20)
-    lines = np.array(frustum_lines(T, CAMERA, size=0.1))  # [8, 2, 3]
-    in_camera = (lines - T[:3, 3]) @ T[:3, :3]
-    np.testing.assert_allclose(in_camera[4:, 0], 0, atol=1e-12)  # four edges leave the centre,
-    np.testing.assert_allclose(in_camera[:4, :, 2], 0.1)  # four lie in the image plane
-    # The corners are those of the outer pixels: half a pixel beyond the first and last centres.
-    assert np.ptp(in_camera[:4, :, 0]) == pytest.approx(0.1 * CAMERA.width / CAMERA.fx)
-
-
-def test_window_geometry_holds_paths_and_points() -> None:
-    o3d = load_open3d()
-    lines, cloud = o3d.geometry.LineSet(), o3d.geometry.PointCloud()
-    fill_lines(o3d, lines, path_lines(curve().poses[:, :3, 3]), "#0072B2")
-    assert len(lines.lines) == 39
-    fill_lines(o3d, lines, path_lines(curve(10).poses[:, :3, 3]), "#0072B2")  # refilled, not appended
-    assert len(lines.lines) == len(lines.colors) == 9
-    fill_cloud(o3d, cloud, np.zeros((3, 3)), np.array([-1.0, 0.5, 2.0]))
-    np.testing.assert_allclose(np.asarray(cloud.colors)[:, 0], [0, 0.5, 1])
 
 
 def test_view_app_saves_a_picture(result_folder: Path, tmp_path: Path, capsys) -> None:
