@@ -1,7 +1,7 @@
 """KISS-ICP on the points of the depth images, where the package `kiss-icp` is installed.
 
-Vizzo et al. 2023, the authors' own code (pip install kiss-icp). It is made for lidars: its settings here
-are scaled to rooms, and it has no motion prior but its own, so that frames without depth are predicted.
+Vizzo et al. 2023, the authors' own code (pip install kiss-icp). It is made for lidars; the settings here
+are scaled to rooms. It sees depth images only, so the poses of frames without depth are predicted.
 """
 
 from typing import Any
@@ -15,8 +15,8 @@ from edslam_ti.trajectory import Trajectory
 
 MAX_RANGE, MIN_RANGE = 10.0, 0.1  # metres
 VOXEL_SIZE = 0.03  # metres, of its local map
-INITIAL_THRESHOLD = 0.1  # metres within which partners are sought at first
-MIN_MOTION = 0.002  # metres from which motion counts for the adaptive threshold
+INITIAL_THRESHOLD = 0.1  # metres, first search radius for correspondences
+MIN_MOTION = 0.002  # metres, smallest motion that changes the adaptive threshold
 
 
 class KissIcpTracker:
@@ -38,7 +38,7 @@ class KissIcpTracker:
         self._T_world_start: np.ndarray | None = None
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; without depth it is the guess, and said to be lost."""
+        """Return the pose of `frame`; without depth, the guess, marked as lost."""
         if frame.depth is None:
             message = "no depth image at this time: pose predicted"
             return TrackingResult(T_world_camera_guess, False, 0.0, message)

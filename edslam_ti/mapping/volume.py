@@ -11,7 +11,7 @@ from edslam_ti.ray_casting import RayCaster, pixel_rays
 
 BLOCK = 8  # voxels along the side of one hashed block
 TRUNCATION_VOXELS = 4.0  # distances are kept up to this many voxels from the surface
-EDGE_STEP = 0.05  # relative difference of neighbouring depths from which they are two surfaces
+EDGE_STEP = 0.05  # relative step between neighbouring depths that separates two surfaces
 FIRST_CAPACITY = 4000  # blocks, 10 kB each; Open3D grows the table by itself
 
 
@@ -21,8 +21,8 @@ def without_depth_edges(
 ) -> np.ndarray:  # [H, W] metres
     """Return depth without the pixels on both sides of a step to a neighbour.
 
-    Rendered depth is a mean over what a pixel covers: at an outline it lies between two surfaces, where
-    fusion would leave a skirt.
+    Rendered depth averages over a pixel: at an outline it lies between two surfaces, where fusion would
+    leave a false surface.
     """
     edge = np.zeros(depth.shape, bool)
     for a, b, at_a, at_b in (

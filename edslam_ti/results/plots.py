@@ -53,7 +53,7 @@ def align_to_truth(estimate: Trajectory, truth: Trajectory | None) -> AlignedPat
         return AlignedPath(positions, unknown)
     try:
         compared = trajectory_errors(estimate, truth)
-    except DataError:  # too few poses to compare: there is something to draw all the same
+    except DataError:  # too few poses to compare: the path is drawn without errors
         return AlignedPath(positions, unknown)
     unknown[compared.indices] = compared.errors_cm / 100
     T = compared.T_truth_estimate
@@ -164,7 +164,7 @@ def _with_ate(name: str, aligned: AlignedPath) -> str:
 
 
 def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]], label: str) -> None:
-    """Draw every value of every series as a dot, group beside group, and each series' median as a bar."""
+    """Draw each value as a dot, grouped, and the median of each series in each group as a bar."""
     series = list(dict.fromkeys(name for values in groups.values() for name in values))
     figure = new_figure(max(5.0, 1.0 + 1.4 * len(groups)), 4.0)
     ax = figure.add_subplot()
@@ -187,7 +187,7 @@ def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]],
 
 
 def plot_drift(path: Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """Draw the error (cm) over the path travelled (m) of each curve, the first poses laid together."""
+    """Draw each curve's error (cm) over the path travelled (m), with the first poses aligned."""
     figure = new_figure(7.0, 4.0)
     ax = figure.add_subplot()
     for (name, (travelled, error)), colour in zip(curves.items(), colours()):
@@ -228,8 +228,8 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
 
 
 def _draw_points(ax: "Axes", runs: Sequence[Result], view: _PlanarView) -> None:
-    """Draw the map points of every run that has some, in their brightness."""
-    ax.set_facecolor("#dfe5ec")  # bright points show, too
+    """Draw the map points of every run that has any, in their brightness."""
+    ax.set_facecolor("#dfe5ec")  # so that bright points are visible
     for run in runs:
         if run.points is None or run.brightness is None:
             continue

@@ -1,4 +1,4 @@
-"""Views of the finished map beside the truth: held out, mapped and novel, each rendered once."""
+"""Views of the finished map, compared with the truth: held out, mapped and novel, each rendered once."""
 
 import csv
 from collections.abc import Iterator
@@ -76,7 +76,7 @@ def save_views(
         if slice_s is not None and kind == "held out":
             in_slice = _image_metrics([v for v in views if slice_s[0] <= v.timestamp <= slice_s[1]], weights)
         numbers[kind] = ViewNumbers(len(views), measured, _depth_l1_cm(views), in_slice)
-        chosen = evenly(len(views), CONTACT_ROWS[kind])
+        chosen = evenly_spaced(len(views), CONTACT_ROWS[kind])
         for k, view in enumerate(views):
             values = _values(view, None if measured is None else measured.views[k])
             table.append({"views": kind, "timestamp_s": f"{view.timestamp:.3f}", **values})
@@ -110,14 +110,14 @@ def _rendered(run: Run, kind: str, truth: Trajectory | None) -> Iterator[Rendere
         most = min(most, len(held_out))
         with_depth = np.flatnonzero(run.samples.has_depth[: len(trajectory)])
         indices = [int(k) for k in with_depth if k not in run.held_out]
-    for k in (indices[j] for j in evenly(len(indices), most)):
+    for k in (indices[j] for j in evenly_spaced(len(indices), most)):
         sample = run.samples.without_events(k)
         view = mapper.render(run.sequence.camera, trajectory.pose(k))
         yield RenderedView(sample.timestamp, sample.image, sample.depth, view)
 
 
 def _novel_views(run: Run, mapper: Mapper, truth: Trajectory | None, most: int) -> Iterator[RenderedView]:
-    """Render at the true poses beside the path, moved into the estimate's frame."""
+    """Render novel views: at true poses off the path, moved into the estimate's frame."""
     if truth is None:
         return
     trajectory, camera = run.slam.trajectory, run.sequence.camera
@@ -126,7 +126,7 @@ def _novel_views(run: Run, mapper: Mapper, truth: Trajectory | None, most: int) 
     surfaces = run.sequence.surfaces_file
     seen_from = TrueSurfaces(surfaces).views(camera, viewpoints(truth)) if surfaces else None
     T_estimate_truth = np.linalg.inv(align_views(trajectory.resampled(truth.timestamps).poses, truth.poses))
-    for true in (novel[k] for k in evenly(len(novel), most)):
+    for true in (novel[k] for k in evenly_spaced(len(novel), most)):
         view = mapper.render(camera, orthonormalized(T_estimate_truth @ true.T_world_camera))
         depth = true.depth
         if seen_from is not None:
@@ -134,7 +134,7 @@ def _novel_views(run: Run, mapper: Mapper, truth: Trajectory | None, most: int) 
         yield RenderedView(true.timestamp, true.image, depth, view)
 
 
-def evenly(count: int, most: int) -> list[int]:
+def evenly_spaced(count: int, most: int) -> list[int]:
     """Return at most `most` indices spread evenly over 0 .. count - 1."""
     return sorted({round(x) for x in np.linspace(0, count - 1, min(count, most))}) if count else []
 
