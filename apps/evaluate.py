@@ -31,7 +31,7 @@ def evaluate(
     """
     if (mesh is None) != (recording is None):
         raise UsageError("--mesh and --recording: expected both or neither; give the missing one")
-    from edslam_ti.evaluation.images import statistics, trajectory_errors
+    from edslam_ti.evaluation.trajectories import statistics, trajectory_errors
     from edslam_ti.trajectory import read_tum
 
     errors = trajectory_errors(read_tum(estimate), read_tum(truth))

@@ -24,7 +24,8 @@ def view(
         results: Folders that apps/slam.py made.
         save: Draw into this PNG file instead of a window.
     """
-    from edslam_ti.results.plots import draw_results, show_results  # after the arguments: slow to load
+    from edslam_ti.results.plots import draw_results  # after the arguments: slow to load
+    from edslam_ti.results.window import show_results
 
     if not results:
         raise UsageError("RESULT: expected at least one results folder, got none")

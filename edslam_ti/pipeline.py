@@ -15,15 +15,16 @@ from edslam_ti import kernels
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, find_sequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation.images import ate_rmse_cm
+from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.methods import METHODS
-from edslam_ti.results.folder import Run, save
-from edslam_ti.results.plots import StubViewer, Viewer
+from edslam_ti.results.folder import save
+from edslam_ti.results.run import Run
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import Tracker, TruePoses
+from edslam_ti.viewer import VIEWERS, Viewer
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 
@@ -38,7 +39,7 @@ def run(config: Config, console: Console | None = None) -> Path:
         kernels.init(config.device, threads=config.threads)
     except RuntimeError as error:  # no such device
         raise EdSlamError(str(error)) from error
-    viewer = Viewer() if config.visualize else StubViewer()
+    viewer = VIEWERS["open3d" if config.visualize else "none"]()
     state = _prepare(config)
     camera, (first, last) = state.sequence.camera, state.samples.timestamps[[0, -1]]
     state.note(f"{state.sequence.scene}: {state.sequence.description}, method {config.method}")
@@ -160,7 +161,7 @@ def _progress(console: Console) -> Progress:
     )
 
 
-def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", console: Console) -> None:
+def _process(state: Run, interrupt: _Interrupt, viewer: Viewer, console: Console) -> None:
     slam, mapper = state.slam, state.slam.mapper
     with _progress(console) as bar:
         task = bar.add_task("mapping" if mapper else "tracking", total=len(state.samples), status="")

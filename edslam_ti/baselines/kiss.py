@@ -1,7 +1,7 @@
 """KISS-ICP on the points of the depth images, where the package `kiss-icp` is installed.
 
-Vizzo et al. 2023, the authors' own code (pip install kiss-icp). It is made for lidars: its settings here
-are scaled to rooms, and it has no motion prior but its own, so that frames without depth are predicted.
+Vizzo et al. 2023, the authors' own code (pip install kiss-icp). It is made for lidars; the settings here
+are scaled to rooms. It sees depth images only, so the poses of frames without depth are predicted.
 """
 
 from typing import Any
@@ -15,8 +15,8 @@ from edslam_ti.trajectory import Trajectory
 
 MAX_RANGE, MIN_RANGE = 10.0, 0.1  # metres
 VOXEL_SIZE = 0.03  # metres, of its local map
-INITIAL_THRESHOLD = 0.1  # metres within which partners are sought at first
-MIN_MOTION = 0.002  # metres from which motion counts for the adaptive threshold
+INITIAL_THRESHOLD = 0.1  # metres, first search radius for correspondences
+MIN_MOTION = 0.002  # metres, smallest motion that changes the adaptive threshold
 
 
 class KissIcpTracker:
@@ -34,16 +34,15 @@ class KissIcpTracker:
         config.adaptive_threshold.initial_threshold = INITIAL_THRESHOLD
         config.adaptive_threshold.min_motion_th = MIN_MOTION
         self._odometry: Any = KissICP(config)
-        self._rays = camera.rays().reshape(-1, 3)
+        self._camera = camera
         self._T_world_start: np.ndarray | None = None
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; without depth it is the guess, and said to be lost."""
+        """Return the pose of `frame`; without depth, the guess, marked as lost."""
         if frame.depth is None:
             message = "no depth image at this time: pose predicted"
             return TrackingResult(T_world_camera_guess, False, 0.0, message)
-        depth = frame.depth.reshape(-1, 1)
-        points = (self._rays * depth)[depth[:, 0] > 0].astype(np.float64)
+        points = self._camera.back_project(frame.depth)
         self._odometry.register_frame(points, np.zeros(len(points)))
         if self._T_world_start is None:
             self._T_world_start = T_world_camera_guess
