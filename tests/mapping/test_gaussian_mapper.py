@@ -10,6 +10,7 @@ import pytest
 import torch
 from sequences import make_slam, settings
 
+from edslam_ti.camera import Camera
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.evaluation.images import depth_l1_cm, evaluate_images
 from edslam_ti.geometry import se3_exp
@@ -20,6 +21,7 @@ from edslam_ti.mapping.gaussian_mapper import (
     spaced,
     stride_in_room,
 )
+from edslam_ti.mapping.gaussians import GaussianMap
 from edslam_ti.mapping.insertion import beside_steps
 from edslam_ti.mapping.rendering import render
 from edslam_ti.mapping.targets import EventImages
@@ -48,9 +50,10 @@ def mapped(
     return slam, slam.mapper
 
 
-def corrected_psnr(mapper: GaussianMapper, slam: Slam, samples: list[Sample], indices: list[int]) -> float:
+def corrected_psnr(camera: Camera, slam: Slam, samples: list[Sample], indices: list[int]) -> float:
     """Return the PSNR in dB of views after EventNeRF's fit."""
-    views = [mapper.render(mapper._camera, slam.trajectory.pose(k)).intensity for k in indices]
+    assert slam.mapper is not None
+    views = [slam.mapper.render(camera, slam.trajectory.pose(k)).intensity for k in indices]
     truths = [image for k in indices if (image := samples[k].image) is not None]
     measured = evaluate_images(views, truths, [np.ones(t.shape, bool) for t in truths])
     assert measured.psnr_corrected_db is not None
@@ -65,11 +68,12 @@ def test_mapping_raises_the_psnr_of_held_out_views(
 ) -> None:
     held_out = {3, 8, 12}
     untouched: dict[str, Any] = {"iterations": 0, "final_iterations": 0}
-    slam, blank = mapped(tiny_sequence, tiny_samples, held_out, finish=False, **untouched)
-    before = corrected_psnr(blank, slam, tiny_samples, sorted(held_out))
+    camera = tiny_sequence.camera
+    slam, _ = mapped(tiny_sequence, tiny_samples, held_out, finish=False, **untouched)
+    before = corrected_psnr(camera, slam, tiny_samples, sorted(held_out))
     steps = {"iterations": 8, "final_iterations": 100}
     slam, mapper = mapped(tiny_sequence, tiny_samples, held_out, **steps)
-    after = corrected_psnr(mapper, slam, tiny_samples, sorted(held_out))
+    after = corrected_psnr(camera, slam, tiny_samples, sorted(held_out))
     assert after > before + 5  # 13 dB to 22 dB was measured
     assert after > 18
     assert mapper.loss < 0.5
@@ -155,7 +159,7 @@ def test_view_of_what_may_show_is_that_of_the_whole_map(
     slam, mapper = mapped(tiny_sequence, tiny_samples[:2], iterations=0, finish=False)
     T = slam.trajectory.pose(0) @ se3_exp(np.array([0.1, 0.0, -0.2, 0.1, 0.4, 0.0]))
     with torch.no_grad():
-        whole = render(mapper.gaussians.activated(), mapper._camera, torch.from_numpy(T), 0.5)
+        whole = render(mapper.gaussians.activated(), tiny_sequence.camera, torch.from_numpy(T), 0.5)
     part = mapper._render(T)
     assert int((whole.dominant < 0).sum()) > 0  # turned so far that the map ends inside the view
     for name in ("intensity", "depth", "alpha", "visible", "dominant"):
@@ -189,7 +193,7 @@ def test_small_map_covers_more_of_what_comes_late(
     def gaps() -> float:
         slam, mapper = mapped(tiny_sequence, tiny_samples, max_gaussians=3300, final_iterations=30)
         assert mapper.num_gaussians <= 3300  # 2677 are of the first view
-        last = mapper.render(mapper._camera, slam.trajectory.pose(len(tiny_samples) - 1))
+        last = mapper.render(tiny_sequence.camera, slam.trajectory.pose(len(tiny_samples) - 1))
         return float((last.alpha < 0.5).mean())
 
     coarser = gaps()
@@ -232,7 +236,7 @@ def test_map_follows_when_a_revisit_corrects_the_path(
         return error
 
     clean, following = depth_error(share=0.0), depth_error()
-    monkeypatch.setattr(GaussianMapper, "_follow", lambda self, trajectory: None)
+    monkeypatch.setattr(GaussianMap, "follow", lambda self, corrections: None)
     staying = depth_error()
     assert following - clean < 0.5 * (staying - clean)
 
@@ -240,7 +244,6 @@ def test_map_follows_when_a_revisit_corrects_the_path(
 def test_start_image_is_solved_as_often_when_frames_are_forgotten(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("edslam_ti.mapping.gaussian_mapper.SOLVE_EVERY", 3)
     slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW | {"max_views": 10}))
     assert isinstance(slam.mapper, GaussianMapper)
     images, solved_at = slam.mapper.images, []
@@ -250,9 +253,10 @@ def test_start_image_is_solved_as_often_when_frames_are_forgotten(
         return EventImages.solve(images, *given)
 
     monkeypatch.setattr(images, "solve", solve)
-    for sample in tiny_samples[:12]:
+    for sample in tiny_samples:
         slam.process(sample, is_held_out=False)
-    assert solved_at[-3:] == [6, 9, 12]
+    assert len(images.frames) == 10
+    assert solved_at[-2:] == [5, 10]  # of 14 frames
 
 
 def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
@@ -297,7 +301,7 @@ def test_budget_leaves_out_steps_and_is_kept_to(
     allowed = 6.0 * (slam.trajectory.timestamps[-1] - slam.trajectory.timestamps[0])
     assert 0.5 * allowed < tick * mapper.num_steps < allowed
     assert mapper.budget.spent < allowed + 2 * tick  # the step in progress
-    assert corrected_psnr(mapper, slam, tiny_samples, [3, 8, 12]) > 15
+    assert corrected_psnr(tiny_sequence.camera, slam, tiny_samples, [3, 8, 12]) > 15
 
 
 def test_too_small_a_budget_still_gives_a_map(
@@ -315,9 +319,9 @@ def test_too_small_a_budget_still_gives_a_map(
 def test_bundle_adjustment_moves_tracked_poses_but_not_the_first(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
-    slam, mapper = mapped(tiny_sequence, tiny_samples[:6], poses="tracked", finish=False)
+    steps = {"finish": False, "final_iterations": 20}
+    slam, mapper = mapped(tiny_sequence, tiny_samples[:6], poses="tracked", **steps)
     before = slam.trajectory.poses
-    mapper._config = mapper._config.model_copy(update={"final_iterations": 20})
     mapper.finish(slam.trajectory, lambda fraction: True)
     moved = np.linalg.norm(slam.trajectory.poses[:, :3, 3] - before[:, :3, 3], axis=1)
     assert moved[0] == 0  # the gauge
