@@ -58,7 +58,10 @@ LIBRARIES: dict[str, list[str]] = {
     "pydantic": ["config", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
     "scipy": ["trajectory", "simulation", "mapping", "results"],
-    "cv2": ["alignment", "datasets", "simulation", "event_images", "tracking", "mapping", "results"],
+    "cv2": [
+        *("alignment", "depth_images", "datasets", "simulation", "event_images", "tracking", "mapping"),
+        "results",
+    ],
     "OpenEXR": ["datasets"],
     "platformdirs": ["datasets"],
     "evo": ["evaluation"],

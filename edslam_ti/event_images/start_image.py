@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
-from edslam_ti.kernels.brightness_image import SAME_SURFACE, ChangeImage, Pair, solve_brightness_image
+from edslam_ti.depth_images import block_depth, block_means
+from edslam_ti.kernels.brightness_image import ChangeImage, Pair, solve_brightness_image
 
 HUBER = 0.15  # log brightness; beyond, an equation counts less (edges, reflections, wrong depth)
 ROBUST = (False, True)  # solutions: the second counts equations less that the first fits badly
@@ -72,7 +73,7 @@ def solve_start_image(
 
 
 def _reduced(view: EventView, reduction: int) -> ChangeImage:
-    depth = None if view.depth is None else _reduced_depth(view.depth, reduction)
+    depth = None if view.depth is None else block_depth(view.depth, reduction)
     return ChangeImage(block_means(view.change, reduction), depth, not view.is_relative)
 
 
@@ -95,16 +96,6 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:  # [h, w]
     return filled
 
 
-def _reduced_depth(depth: np.ndarray, reduction: int) -> np.ndarray:
-    """Return block means where all depths of a block exist and lie on one surface, else missing."""
-    if reduction == 1:
-        return depth
-    h, w = depth.shape[0] // reduction, depth.shape[1] // reduction
-    blocks = depth[: h * reduction, : w * reduction].reshape(h, reduction, w, reduction)
-    low, high = blocks.min((1, 3)), blocks.max((1, 3))
-    return np.where((low > 0) & (high - low < 2 * SAME_SURFACE * high), blocks.mean((1, 3)), 0)
-
-
 def _enlarged(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:  # [h, w] -> [H, W]
     """Return an image of block means at full size, bilinearly; odd edges repeat the last block."""
     if image.shape == shape:
@@ -113,12 +104,3 @@ def _enlarged(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:  # [h, w
     h, w = image.shape[0] * r, image.shape[1] * r
     enlarged = cv2.resize(image.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
     return np.pad(enlarged, ((0, shape[0] - h), (0, shape[1] - w)), mode="edge")
-
-
-def block_means(image: np.ndarray, reduction: int) -> np.ndarray:  # [H, W] -> [H / r, W / r]
-    """Return the means of blocks of reduction x reduction pixels, odd edges cut off."""
-    if reduction == 1:
-        return image
-    h, w = image.shape[0] // reduction, image.shape[1] // reduction
-    cut = image[: h * reduction, : w * reduction]
-    return cut.reshape(h, reduction, w, reduction).mean((1, 3), dtype=np.float32)

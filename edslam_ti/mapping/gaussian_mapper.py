@@ -10,13 +10,14 @@ from torch import Tensor
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
+from edslam_ti.depth_images import beside_steps, with_holes_filled
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.sharp import SharpImages
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.mapping.densification import Densifier
 from edslam_ti.mapping.gaussians import GaussianMap
-from edslam_ti.mapping.insertion import beside_steps, depth_to_points, surface_discs, with_holes_filled
+from edslam_ti.mapping.insertion import depth_to_points, surface_discs
 from edslam_ti.mapping.keyframes import Keyframe, is_keyframe
 from edslam_ti.mapping.losses import scale_loss, view_loss
 from edslam_ti.mapping.mapper import Progress

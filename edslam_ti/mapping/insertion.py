@@ -1,16 +1,12 @@
 """Depth images to points (Open3D)."""
 
-import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.depth_images import is_smooth
 from edslam_ti.errors import DataError
 from edslam_ti.open3d_loader import load_open3d
 
-HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
-FAR_SIDE = 90  # percentile of the depth around a hole
-BEHIND = 1.25  # times that is assumed in it: what is too near would hide surfaces measured later
-STEP = 0.03  # second difference of depth, as a share of it, from which neighbours are two surfaces
 FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
 
 
@@ -75,41 +71,6 @@ def surface_discs(
     return np.stack([w, x, y, z], -1).astype(np.float32), stretch.astype(np.float32)
 
 
-def beside_steps(
-    depth: np.ndarray,  # [H, W] metres, 0 = missing
-) -> np.ndarray:  # [H, W] bool
-    """Return the pixels beside which depth jumps or ends: outlines, but no slanted surface."""
-    padded = np.pad(depth, 1, mode="reflect", reflect_type="odd")  # goes on as it does
-    across = padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * depth
-    down = padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * depth
-    return np.maximum(np.abs(across), np.abs(down)) > STEP * depth
-
-
-def with_holes_filled(
-    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
-) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
-    """Return depth with large holes put behind the far side of what surrounds them.
-
-    A sensor sees nothing in windows and beyond its range; something is there all the same, and it is not in
-    front. Narrow holes (shadows of the sensor's projector, noise at edges) stay: another view sees them.
-    """
-    missing = (depth <= 0).astype(np.uint8)
-    holes = cv2.morphologyEx(missing, cv2.MORPH_OPEN, np.ones((HOLE_WIDTH, HOLE_WIDTH), np.uint8))
-    filled = depth.copy()
-    number, labels, boxes, _ = cv2.connectedComponentsWithStats(holes)
-    reach = 2 * (HOLE_WIDTH // 2) + 1  # beyond what opening has removed of the rim
-    for label in range(1, number):
-        left, top, width, height, _ = boxes[label]
-        box = np.s_[max(top - reach, 0) : top + height + reach, max(left - reach, 0) : left + width + reach]
-        hole = (labels[box] == label).astype(np.uint8)
-        near = cv2.dilate(hole, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-        around = depth[box][near & (depth[box] > 0)]
-        if len(around):
-            gap = near & (depth[box] <= 0)
-            filled[box][gap] = BEHIND * np.percentile(around, FAR_SIDE)
-    return filled
-
-
 def _unit(vectors: np.ndarray) -> np.ndarray:  # [N, 3]
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
@@ -120,8 +81,8 @@ def _differences(points: np.ndarray, depth: np.ndarray, axis: int) -> np.ndarray
     inner, before, after = ([slice(None), slice(None)] for _ in range(3))
     inner[axis], before[axis], after[axis] = slice(1, -1), slice(None, -2), slice(2, None)
     a, b, c = (depth[tuple(part)] for part in (before, inner, after))
-    is_smooth = (a > 0) & (b > 0) & (c > 0) & (np.abs(a + c - 2 * b) < 0.02 * b)
-    result[tuple(inner)] = np.where(is_smooth[..., None], points[tuple(after)] - points[tuple(before)], 0)
+    goes_on = is_smooth(a, b, c)
+    result[tuple(inner)] = np.where(goes_on[..., None], points[tuple(after)] - points[tuple(before)], 0)
     return result
 
 

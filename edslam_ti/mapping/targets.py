@@ -10,12 +10,12 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
+from edslam_ti.depth_images import block_means, with_holes_filled
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.sharp import SharpImage, SharpImages
-from edslam_ti.event_images.start_image import EventView, block_means, solve_start_image
+from edslam_ti.event_images.start_image import EventView, solve_start_image
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame
-from edslam_ti.mapping.insertion import with_holes_filled
 from edslam_ti.mapping.keyframes import EventArchive
 from edslam_ti.trajectory import Trajectory
 

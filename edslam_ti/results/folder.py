@@ -19,6 +19,7 @@ from rich.console import Console
 from edslam_ti import __version__
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
+from edslam_ti.depth_images import without_depth_edges
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation.images import (
     ImageMetrics,
@@ -37,7 +38,6 @@ from edslam_ti.geometry import orthonormalized
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.mapping.rendering import View
-from edslam_ti.mapping.volume import without_depth_edges
 from edslam_ti.output import atomic_file, atomic_folder
 from edslam_ti.results.export import fuse_mesh, write_gaussian_ply, write_mesh, write_points
 from edslam_ti.results.pictures import (

@@ -12,6 +12,7 @@ from sequences import make_slam, settings
 
 from edslam_ti.camera import Camera
 from edslam_ti.datasets import EventDepthSequence, Sample
+from edslam_ti.depth_images import beside_steps
 from edslam_ti.evaluation.images import depth_l1_cm, evaluate_images
 from edslam_ti.geometry import se3_exp
 from edslam_ti.mapping.gaussian_mapper import (
@@ -22,7 +23,6 @@ from edslam_ti.mapping.gaussian_mapper import (
     stride_in_room,
 )
 from edslam_ti.mapping.gaussians import GaussianMap
-from edslam_ti.mapping.insertion import beside_steps
 from edslam_ti.mapping.rendering import render
 from edslam_ti.mapping.targets import EventImages
 from edslam_ti.slam import Slam

@@ -5,7 +5,7 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.mapping.insertion import beside_steps, depth_to_points, surface_discs, with_holes_filled
+from edslam_ti.mapping.insertion import depth_to_points, surface_discs
 
 CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
 
@@ -92,27 +92,3 @@ def test_disc_beside_missing_depth_or_an_edge_faces_the_camera() -> None:
     np.testing.assert_allclose(stretch, 1.0)
     _, stretch = surface_discs(depth, camera, np.eye(4), np.array([[2, 2]]), max_stretch=4.0)
     assert stretch[0] > 1  # seen from the side
-
-
-def test_steps_are_found_on_both_sides_and_not_on_a_slanted_plane() -> None:
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-    plane = (-2.0 / (camera.rays() @ np.array([0.8, 0.0, -0.6]))).astype(np.float32)  # 1.7 to 10 m away
-    assert not beside_steps(plane).any()
-    step = np.full(camera.shape, 2.0, np.float32)
-    step[20:, 30:] = 2.1
-    expected = np.zeros(camera.shape, bool)
-    expected[20:, 29:31] = expected[19:21, 30:] = True
-    assert (beside_steps(step) == expected).all()
-
-
-def test_large_holes_lie_behind_what_surrounds_them_and_narrow_ones_stay() -> None:
-    depth = np.full((60, 80), 2.0, np.float32)
-    depth[:, 40:] = 3.0
-    depth[10:40, 30:60] = 0  # a window
-    depth[50, :] = 0  # a line that the sensor missed
-    filled = with_holes_filled(depth)
-    assert filled[10:40, 30:60] == pytest.approx(1.25 * 3.0)
-    assert (filled[50] == 0).all()
-    measured = depth > 0
-    assert (filled[measured] == depth[measured]).all()
-    assert (with_holes_filled(np.zeros_like(depth)) == 0).all()  # nothing to go by
