@@ -33,7 +33,7 @@ ORDERS: dict[str, list[str]] = {
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
-    "event_images": ["solve", "start_image", "contrast", "sharp"],
+    "event_images": ["change", "solve", "contrast", "sharp"],
     "tracking": [
         *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "place_recognition"),
         *("pose_graph", "image_tracker"),

@@ -229,7 +229,7 @@ class GaussianMapper:
     def _take_in_depth(self, frame: Frame, index: int, trajectory: Trajectory) -> None:
         assert frame.depth is not None
         T = trajectory.pose(index)
-        candidate = Keyframe(index, frame.timestamp)
+        candidate = Keyframe(index)
         view = self._render(T)
         if not self.keyframes or self._is_keyframe(candidate, frame.depth, view.visible, trajectory):
             self.keyframes.append(candidate)

@@ -11,12 +11,11 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
 from edslam_ti.depth_images import block_means, with_holes_filled
+from edslam_ti.event_images.change import ChangeArchive
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.sharp import SharpImage, SharpImages
-from edslam_ti.event_images.start_image import EventView, solve_start_image
-from edslam_ti.events import Events
-from edslam_ti.frame import Frame
-from edslam_ti.mapping.keyframes import EventArchive
+from edslam_ti.event_images.solve import EventView, solve_start_image
+from edslam_ti.frame import EventCounts, Frame
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
@@ -57,7 +56,7 @@ class EventImages:
         self._contrast_threshold = contrast.value
         self._config = config
         self._sharp_images = sharp_images
-        self._archive = EventArchive(camera.shape, *contrast.relative)
+        self._archive = ChangeArchive(camera.shape, *contrast.relative)
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
         self._stretches: list[_Stretch] = []
@@ -82,8 +81,8 @@ class EventImages:
 
     def append(self, frame: Frame, index: int) -> None:
         """Add a frame's events, and its image unless the frame is held out."""
-        self._archive.append(frame.events, index, is_kept=not frame.is_held_out)
-        self._find_hot_pixels(frame.events)
+        self._archive.add(frame.event_counts, index, is_kept=not frame.is_held_out)
+        self._find_hot_pixels(frame.event_counts)
         if not frame.is_held_out:
             self._depths[index] = frame.depth
             self._take_in_grey(frame, index)
@@ -91,7 +90,7 @@ class EventImages:
             level = np.float32(np.log(self._config.background))
             self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
         elif frame.timestamp - self._started > self._config.stretch:
-            change = self._contrast_threshold * self._archive.begin_again()
+            change = self._contrast_threshold * self._archive.reset()
             self._begin(index + 1, frame.timestamp, self._stretches[-1].start + change)
 
     def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
@@ -153,7 +152,7 @@ class EventImages:
             older = range(1, max(2, len(frames) // 2))
             candidates = [i for i in older if frames[i] not in keep] or list(older)
             densest = min(candidates, key=lambda i: frames[i + 1] - frames[i - 1])
-            self._archive.forget(frames[densest])
+            self._archive.drop(frames[densest])
             del self._depths[frames[densest]]
             self._grey.pop(frames[densest], None)
             in_use = {self._stretch(k).first for k in self.frames}
@@ -193,9 +192,8 @@ class EventImages:
             change[self.hot] = cv2.medianBlur(change, 5)[self.hot]
         return change
 
-    def _find_hot_pixels(self, events: Events) -> None:
-        pixel = events.y.astype(np.int64) * self._camera.width + events.x
-        self._num_events.ravel()[:] += np.bincount(pixel, minlength=self._num_events.size)
+    def _find_hot_pixels(self, counts: EventCounts) -> None:
+        self._num_events += counts.numbers.sum(-1)
         around = cv2.medianBlur(self._num_events, 5)
         self.hot = self._num_events > np.maximum(HOT * around, HOT_EVENTS)
 

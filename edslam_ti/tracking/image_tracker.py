@@ -10,8 +10,8 @@ import numpy as np
 from edslam_ti.alignment import MIN_PIXELS
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
+from edslam_ti.event_images.change import BrightnessChange
 from edslam_ti.event_images.contrast import ContrastThreshold
-from edslam_ti.event_images.solve import BrightnessChange
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse, is_near, se3_exp, se3_log
 from edslam_ti.kernels.patch_warp import NormalEquations
@@ -104,7 +104,7 @@ class BrightnessTracker:
     # --- what is measured ---
 
     def _take_in(self, frame: Frame, index: int) -> Moment:
-        self._change.add(frame.events)
+        self._change.add(frame.event_counts)
         moment = self._aligner.moment(index, frame, self._change.log_brightness())
         self._moments = [*self._moments, moment][-WINDOW:]
         return moment

@@ -5,7 +5,7 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.depth_images import block_means
-from edslam_ti.event_images.start_image import EventView, solve_start_image
+from edslam_ti.event_images.solve import EventView, solve_start_image
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 DEPTH = 2.0  # metres, of a wall parallel to the image
