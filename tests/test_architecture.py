@@ -39,8 +39,8 @@ ORDERS: dict[str, list[str]] = {
         *("pose_graph", "image_tracker"),
     ],
     "mapping": [
-        *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
-        *("targets", "poses", "gaussian_mapper"),
+        *("gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion", "keyframes"),
+        *("densification", "recolouring", "targets", "poses", "gaussian_mapper"),
     ],
     "evaluation": ["images", "meshes"],
     "results": ["pictures", "export", "plots", "folder"],

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from edslam_ti.config import KeyframeConfig
 
 
@@ -15,12 +17,21 @@ class Keyframe:
     index: int  # of the frame in the trajectory, where its pose is
 
 
+def covisibility(
+    visible: Tensor,  # [N] bool, Gaussians visible in a view
+    other: Tensor,  # [N] bool, in another
+) -> float:
+    """Return the share of the Gaussians visible in either view that are visible in both."""
+    union = int((visible | other).sum())
+    return int((visible & other).sum()) / max(union, 1)
+
+
 def is_keyframe(
-    covisibility: float,  # with the last keyframe, 0 to 1
+    shared: float,  # covisibility with the last keyframe, 0 to 1
     translation: float,  # from the last keyframe, metres
     median_depth: float,  # metres
     config: KeyframeConfig,
 ) -> bool:
     """Return whether a frame sees enough that is new to become a keyframe."""
     is_far = translation > config.max_translation * median_depth
-    return covisibility < config.min_covisibility or is_far
+    return shared < config.min_covisibility or is_far

@@ -197,7 +197,9 @@ def _metrics(state: Run, of_map: dict[str, Any]) -> dict[str, Any]:
         "num_gaussians": mapper.num_gaussians if mapper is not None else 0,
         "num_events": state.num_events,
         "num_mapping_steps": mapper.num_steps if isinstance(mapper, GaussianMapper) else None,
-        "num_hot_pixels": int(mapper.images.hot.sum()) if isinstance(mapper, GaussianMapper) else None,
+        "num_hot_pixels": int(mapper.images.noisy_pixels.sum())
+        if isinstance(mapper, GaussianMapper)
+        else None,
         "contrast_threshold": _rounded(state.contrast.value),
         "contrast_threshold_source": state.contrast.source,
         "contrast_threshold_positive": _rounded(state.contrast.positive),

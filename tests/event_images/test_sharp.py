@@ -112,12 +112,12 @@ def test_between_images_events_carry_on(
     images = EventImages(rare.camera, THRESHOLD, config, SharpImages(rare, THRESHOLD, config))
     trajectory = Trajectory()
     for k, frame in enumerate(frames_of(rare)):
-        images.append(frame, k)
+        images.add(frame, k)
         T = tiny_samples[k].T_world_camera
         assert T is not None
         trajectory.append(frame.timestamp, T)
     assert images.solve(trajectory, is_thorough=True)
-    images.thin_out(keep=set())
+    images.drop_surplus(keep=set())
     assert len(images.frames) == 10
     errors = []
     for k in images.frames:
