@@ -156,7 +156,7 @@ def _differences(points: np.ndarray, depth: np.ndarray, axis: int) -> np.ndarray
     result = np.zeros_like(points)
     inner, before, after = ([slice(None), slice(None)] for _ in range(3))
     inner[axis], before[axis], after[axis] = slice(1, -1), slice(None, -2), slice(2, None)
-    a, b, c = (depth[tuple(part)] for part in (before, inner, after))
+    a, b, c = (depth[tuple(where)] for where in (before, inner, after))
     goes_on = is_smooth(a, b, c)
     result[tuple(inner)] = np.where(goes_on[..., None], points[tuple(after)] - points[tuple(before)], 0)
     return result

@@ -1,4 +1,4 @@
-"""Images from events in a tiny room: close to what a camera would have seen, over several stretches."""
+"""Images from events in a tiny room: close to what a camera would have seen, over several windows."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -118,8 +118,8 @@ def test_pixels_that_fire_by_themselves_are_found_and_replaced_by_their_neighbou
     for sample in tiny_samples:
         x, y = np.repeat(np.array([[30, 40], [77, 12]], np.int16), 40, axis=0).T
         ones = np.ones(len(x), np.int8)
-        hot = Events(x.copy(), y.copy(), np.full(len(x), sample.timestamp), ones)
-        noisy.append(replace(sample, events=Events.concatenate([sample.events, hot])))
+        noise = Events(x.copy(), y.copy(), np.full(len(x), sample.timestamp), ones)
+        noisy.append(replace(sample, events=Events.concatenate([sample.events, noise])))
     images, _ = images_of(tiny_sequence, noisy)
     assert np.argwhere(images.noisy_pixels).tolist() == [[12, 77], [40, 30]]
     assert errors(images, tiny_samples).max() < 1.1 * errors(clean, tiny_samples).max() + 0.02
