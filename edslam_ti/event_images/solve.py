@@ -27,6 +27,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.depth_images import block_depth, block_means
+from edslam_ti.geometry import inverse
 from edslam_ti.kernels import brightness_image, time_surface
 from edslam_ti.kernels.brightness_image import ChangeImage, Pair, solve_brightness_image
 from edslam_ti.kernels.runtime import check_shape
@@ -106,7 +107,7 @@ def solve_start_image(
     Only its difference to `start` is at reduced size: details of `start` smaller than that survive.
     """
     log_brightness, observed = start.astype(np.float32), np.zeros(camera.shape, bool)
-    T_camera_world = [np.linalg.inv(v.T_world_camera) for v in views]
+    T_camera_world = [inverse(v.T_world_camera) for v in views]
     pairs = [Pair(k, j, T_camera_world[j] @ views[k].T_world_camera) for k, j in _pairs(views)]
     for reduction, count in iterations.items():
         small = camera if reduction == 1 else camera.downscaled(reduction)

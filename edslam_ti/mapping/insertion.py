@@ -8,6 +8,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
 from edslam_ti.depth_images import beside_steps, is_smooth, with_holes_filled
 from edslam_ti.errors import DataError
+from edslam_ti.geometry import inverse
 from edslam_ti.mapping.budget import stride_for_budget
 from edslam_ti.open3d_loader import load_open3d
 
@@ -106,7 +107,7 @@ def depth_to_points(
     cloud = o3d.geometry.PointCloud.create_from_depth_image(
         o3d.geometry.Image(np.ascontiguousarray(np.where(used, depth, 0), np.float32)),
         o3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *camera.intrinsics),
-        np.linalg.inv(T_world_camera),
+        inverse(T_world_camera),
         depth_scale=1.0,
         depth_trunc=2 * FARTHEST,
     )

@@ -15,7 +15,7 @@ from torch import Tensor
 from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, linearised, residual_model
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig, TrackingConfig
-from edslam_ti.geometry import is_near, orthonormalized, se3_exp, se3_log
+from edslam_ti.geometry import inverse, is_near, orthonormalized, se3_exp, se3_log
 from edslam_ti.kernels.patch_warp import Patches
 from edslam_ti.mapping.gaussians import GaussianMap
 from edslam_ti.mapping.rendering import render_map
@@ -43,7 +43,7 @@ class PoseMemory:
         """Return by what poses differ from those remembered, T_new T_old^-1, of frames that do differ."""
         poses, old = trajectory.poses, self._poses
         differ = np.flatnonzero((poses[: len(old)] != old).any((1, 2)))
-        return {int(k): poses[k] @ np.linalg.inv(old[k]) for k in differ}
+        return {int(k): poses[k] @ inverse(old[k]) for k in differ}
 
 
 class PoseRefiner:
