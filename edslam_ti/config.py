@@ -114,14 +114,15 @@ class TrackingConfig(Stage):
 
 
 class KeyframeConfig(Stage):
-    """When an event chunk becomes a keyframe, and what it keeps (Sec. III-E)."""
+    """When a frame becomes a keyframe, and how many frames are the newest (Sec. III-E)."""
 
     min_covisibility: float = Field(0.85, gt=0, lt=1)
     """A frame sharing a smaller fraction of visible Gaussians with the last keyframe becomes one."""
     max_translation: float = Field(0.05, gt=0)
     """Also beyond this translation relative to the median depth (MonoGS: 0.02 to 0.04)."""
     num_chunks: int = Field(5, ge=1)
-    """N: event chunks stored with a keyframe."""
+    """N: so many newest frames (event chunks) get half of the optimisation steps after each frame; all kept
+    frames share the other half."""
 
 
 class MappingConfig(Stage):
@@ -132,7 +133,7 @@ class MappingConfig(Stage):
     iterations: int = Field(5, ge=0)
     """Optimisation steps after each frame."""
     final_iterations: int = Field(400, ge=0)
-    """Steps over all keyframes after the last frame."""
+    """Steps over all kept frames after the last frame."""
     budget: float | None = Field(None, gt=0)
     """Seconds of mapping per second of data, steps left out to keep to it (results then depend on the
     machine's speed); taking in depth and solving brightness are never left out. Omitted: no limit."""
@@ -163,11 +164,12 @@ class MappingConfig(Stage):
     """Seconds over which such an image integrates, centred on its time; omitted: the data set's own
     (camera.json), else 0: images are sharp."""
     event_weight: float = Field(1.0, ge=0)
-    """lambda_event of Eq. 16 (paper: 0.7)."""
+    """lambda_event of Eq. 16 (paper: 0.7). It weighs the mean square of the differences of log brightness
+    divided by 0.1 (BRIGHTNESS_VARIANCE in mapping/losses.py): at 1 the mean square itself weighs 10."""
     depth_weight: float = Field(2.0, ge=0)
-    """lambda_d of Eq. 16 (paper: 0.05)."""
+    """lambda_d of Eq. 16 (paper: 0.05). It weighs the mean absolute depth error in metres (Eq. 15)."""
     scale_weight: float = Field(0.01, ge=0)
-    """lambda_reg of Eq. 16 (paper: 0.25)."""
+    """lambda_reg of Eq. 16 (paper: 0.25). It weighs the mean excess of Eq. 14."""
     max_scale_ratio: float = Field(10.0, ge=1)
     """r of Eq. 14: Gaussians may be this much longer than thick."""
     densify: bool = False

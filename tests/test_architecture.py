@@ -33,15 +33,14 @@ ORDERS: dict[str, list[str]] = {
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
-    "event_images": ["solve", "start_image", "contrast", "sharp"],
+    "event_images": ["change", "solve", "contrast", "sharp"],
     "tracking": [
         *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "smoothing", "gaps"),
         *("place_recognition", "pose_graph", "loop_closure", "image_tracker"),
     ],
     "mapping": [
-        "gaussian_ply",
-        *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
-        *("targets", "poses", "gaussian_mapper"),
+        *("gaussian_ply", "gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion"),
+        *("keyframes", "densification", "recolouring", "targets", "poses", "gaussian_mapper"),
     ],
     "evaluation": ["trajectories", "lpips", "images", "meshes"],
     "results": [
@@ -61,7 +60,10 @@ LIBRARIES: dict[str, list[str]] = {
     "pydantic": ["config", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
     "scipy": ["trajectory", "simulation", "mapping", "results"],
-    "cv2": ["alignment", "datasets", "simulation", "event_images", "tracking", "mapping", "results"],
+    "cv2": [
+        *("alignment", "depth_images", "datasets", "simulation", "event_images", "tracking", "mapping"),
+        "results",
+    ],
     "OpenEXR": ["datasets"],
     "platformdirs": ["datasets"],
     "evo": ["evaluation"],

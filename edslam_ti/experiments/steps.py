@@ -34,7 +34,6 @@ from edslam_ti.experiments.kernel_times import (
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.view_losses import compare_change
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
-from edslam_ti.mapping.losses import brightness_change, event_loss
 from edslam_ti.mapping.rendering import render
 from edslam_ti.methods import METHODS
 from edslam_ti.output import atomic_file
@@ -44,7 +43,7 @@ from edslam_ti.slam import Slam
 WARM_UP_FRAMES = 3
 MOTION = (0.01, 0.0, 0.005)  # metres between the two views of a mapping step
 EPSILON, BACKGROUND = 0.004, 0.5
-EVENT_FLOOR = 1e-3  # that of losses.event_loss
+EVENT_FLOOR = 1e-3  # an interval without events must not divide by zero
 
 
 def rows(
@@ -94,8 +93,31 @@ def write(
 # --- mapping step ---
 
 
+def brightness_change(
+    intensity_start: Tensor,  # [H, W]
+    intensity_end: Tensor,  # [H, W]
+    epsilon: float,
+) -> Tensor:  # [H, W]
+    """Return the synthesised log-brightness change, Eq. 10 of the paper."""
+    return torch.log(intensity_end + epsilon) - torch.log(intensity_start + epsilon)
+
+
+def event_loss(
+    predicted: Tensor,  # [H, W] Eq. 10
+    measured: Tensor,  # [H, W] Eq. 11
+) -> Tensor:
+    """Return the paper's Eq. 12 squared and divided by the measured mean square.
+
+    The raw loss grows with motion and interval length; divided, every interval weighs alike.
+    """
+    return (predicted - measured).square().mean() / (measured.square().mean() + EVENT_FLOOR)
+
+
 def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
-    """Two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam."""
+    """The paper's step: two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam.
+
+    The mapper compares one view (losses.py), which costs half of it.
+    """
     (means, quats, scales, _, colors, pose), intrinsics = room_scene(count, *size)
     camera = Camera(*size, *intrinsics)
     gaussians = GaussianMap(Config().mapping)

@@ -11,28 +11,7 @@ from edslam_ti.ray_casting import RayCaster, pixel_rays
 
 BLOCK = 8  # voxels along the side of one hashed block
 TRUNCATION_VOXELS = 4.0  # distances are kept up to this many voxels from the surface
-EDGE_STEP = 0.05  # relative step between neighbouring depths that separates two surfaces
 FIRST_CAPACITY = 4000  # blocks, 10 kB each; Open3D grows the table by itself
-
-
-def without_depth_edges(
-    depth: np.ndarray,  # [H, W] metres, 0 = missing
-    relative_step: float = EDGE_STEP,
-) -> np.ndarray:  # [H, W] metres
-    """Return depth without the pixels on both sides of a step to a neighbour.
-
-    Rendered depth averages over a pixel: at an outline it lies between two surfaces, where fusion would
-    leave a false surface.
-    """
-    edge = np.zeros(depth.shape, bool)
-    for a, b, at_a, at_b in (
-        (depth[:-1], depth[1:], edge[:-1], edge[1:]),
-        (depth[:, :-1], depth[:, 1:], edge[:, :-1], edge[:, 1:]),
-    ):
-        step = np.abs(a - b) > relative_step * np.minimum(a, b)
-        at_a |= step
-        at_b |= step
-    return np.where(edge, 0, depth)
 
 
 class TsdfVolume:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from edslam_ti.depth_images import without_depth_edges
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation.images import LinearFit
 from edslam_ti.mapping.mapper import Mapper
-from edslam_ti.mapping.volume import without_depth_edges
 from edslam_ti.output import atomic_folder
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_of

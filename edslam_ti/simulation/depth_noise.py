@@ -6,6 +6,7 @@ Axial noise after Nguyen et al. 2012, quantised disparity after Handa et al. 201
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.depth_images import beside_edges
 
 MIN_DEPTH, MAX_DEPTH = 0.4, 5.0  # metres
 DISPARITY_STEP = 1 / 351.3  # 1/metre: inverse depth is quantised to this (2.8 mm at 1 m, 11 mm at 2 m)
@@ -31,7 +32,7 @@ def kinect_depth(
     jitter = rng.normal(0, LATERAL_DEVIATION, (2, height, width))
     row = np.clip(np.rint(v + jitter[0]), 0, height - 1).astype(int)
     column = np.clip(np.rint(u + jitter[1]), 0, width - 1).astype(int)
-    edge = _edges(depth)
+    edge = beside_edges(depth, EDGE_STEP)
     z = np.where(edge, depth[row, column], depth).astype(np.float64)  # surfaces inside keep their pixel
 
     sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
@@ -67,19 +68,3 @@ def viewing_cosine(
     lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
     cosine = np.abs((normals * rays).sum(-1)) / np.maximum(lengths, 1e-12)
     return np.where(depth > 0, cosine, 0.0)
-
-
-def _edges(depth: np.ndarray) -> np.ndarray:  # [H, W] bool
-    """Return pixels beside a depth step (both sides of it)."""
-    edge = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        a = depth[:-1] if axis == 0 else depth[:, :-1]
-        b = depth[1:] if axis == 0 else depth[:, 1:]
-        step = np.abs(a - b) > EDGE_STEP * np.minimum(a, b)
-        if axis == 0:
-            edge[:-1] |= step
-            edge[1:] |= step
-        else:
-            edge[:, :-1] |= step
-            edge[:, 1:] |= step
-    return edge
