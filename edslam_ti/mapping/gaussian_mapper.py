@@ -23,7 +23,6 @@ from edslam_ti.mapping.mapper import Progress
 from edslam_ti.mapping.poses import MapAligner
 from edslam_ti.mapping.rendering import RenderOutput, View, drawable, render, render_view
 from edslam_ti.mapping.targets import EventImages, evenly
-from edslam_ti.memory import release_free_memory
 from edslam_ti.trajectory import Trajectory
 
 ONLINE_SHARE = 0.5  # of the budget, for the steps while the map grows
@@ -147,7 +146,6 @@ class GaussianMapper:
         """Add the frame's events and Gaussians, then optimise over the window."""
         self.budget.start(frame.timestamp)
         self._update(frame, trajectory)
-        release_free_memory()
         self.budget.stop()
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:

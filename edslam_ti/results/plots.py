@@ -235,7 +235,7 @@ def load_result(folder: Path) -> Result:
     trajectory_path = folder / "trajectory_tum.txt"
     if not trajectory_path.is_file():
         raise DataError(
-            f"{folder}: not a results folder (no trajectory_tum.txt); give one that apps/slam.py made"
+            f"{folder}: not a results folder (no trajectory_tum.txt); give one that `edslam slam` made"
         )
     truth_path, metrics_path = folder / "truth_tum.txt", folder / "metrics.json"
     try:
@@ -383,7 +383,7 @@ def check_display() -> None:
     ):
         raise EdSlamError(
             "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); run without "
-            "--visualize, and draw finished runs with: python apps/view.py RESULT --save FILE.png"
+            "--visualize, and draw finished runs with: edslam view RESULT --save FILE.png"
         )
 
 
