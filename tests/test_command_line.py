@@ -229,6 +229,27 @@ print("loaded:", *sys.modules)
     assert "edslam_ti.commands.simulate" in loaded.split()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *("slam --dataset builtin", "simulate --scene office0 --out x", "benchmark --suites slam"),
+        *(f"reproduce {name}" for name in REPRODUCE),
+    ],
+)
+def test_kernels_are_loaded_before_anything_loads_torch(arguments: str) -> None:
+    code = f"""
+import sys
+from edslam_ti import cold_start
+def load_kernels():
+    sys.exit("torch" in sys.modules)
+cold_start.load_kernels = load_kernels
+from edslam_ti import commands
+commands.run({arguments.split()})
+"""
+    result = _run("-c", code)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
 def test_unknown_commands_are_refused_with_the_nearest_name(capsys: pytest.CaptureFixture[str]) -> None:
     code, message = failure(capsys, lambda: run(["slm"]))
     assert code == 2
