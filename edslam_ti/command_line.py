@@ -50,13 +50,11 @@ def with_presets(choices: Config, differences: dict[str, Any], configs: Path = C
 
     Without --dataset the data folder is looked at to find the format, which loads torch.
     """
-    from edslam_ti.datasets import DATASETS, find_sequence
+    dataset = choices.dataset
+    if dataset is None:
+        from edslam_ti.datasets import find_sequence
 
-    known = [*DATASETS, "builtin"]
-    if choices.dataset is not None and choices.dataset not in known:
-        hint = nearest_name_hint(choices.dataset, known)
-        raise ConfigError(f"dataset: expected one of {', '.join(known)}, got '{choices.dataset}'{hint}")
-    dataset = choices.dataset or find_sequence(choices)[0]
+        dataset, _ = find_sequence(choices)
     values = merged(Config().model_dump(), dataset_differences(dataset, configs))
     values = merged(values, dict(METHODS[choices.method].overrides))
     return Config.validated(merged(values, differences), source="command line")
