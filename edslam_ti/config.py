@@ -41,46 +41,88 @@ class TimeSurfaceConfig(Stage):
     """Standard deviation in pixels of the Gaussian that smooths the surface before alignment."""
 
 
-class TrackingConfig(Stage):
-    """Bidirectional patch tracker, Sec. III-B."""
+class ImageTrackingConfig(Stage):
+    """Tracking by log-brightness images made of events, the default tracker (beyond the paper)."""
 
-    num_patches: int = Field(400, ge=1)
-    """Patches per direction: the best row of Table II (the text says 200)."""
-    patch_size: int = Field(9, ge=1, le=31)
-    """Side p of a patch in pixels, odd (Table I)."""
-    min_time_surface: float = Field(0.3, ge=0, lt=1)
-    """Patch centres are drawn where the surface exceeds this (tau in Sec. III-B; not given there)."""
-    max_depth_difference: float = Field(0.1, gt=0)
-    """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
+    image_width: int = Field(192, ge=16)
+    """Images are halved until they are about this many pixels wide: the noise of events averages out."""
+    num_pixels: int = Field(8100, ge=100)
+    """Pixels of a keyframe's image that are aligned; half as many at half the size."""
+    strong_gradient: float = Field(0.02, ge=0)
+    """Pixels with a larger gradient are aligned first, log brightness per pixel."""
+    steps: int = Field(6, ge=1)
+    """At most this many Levenberg-Marquardt steps a level; twice as many without depth."""
+    max_misfit: float = Field(0.25, gt=0)
+    """Median absolute difference of log brightness beyond which tracking has failed."""
+    doubtful: float = Field(1.25, ge=1)
+    """A frame that fits this many times worse than usual is aligned from the last pose, too."""
+    max_misfits: int = Field(4, ge=0)
+    """After more failed frames in a row than this, the keyframe's image is given up."""
+    window: int = Field(12, ge=5)
+    """Frames that a keyframe's image can be solved from."""
+    observations: int = Field(5, ge=2)
+    """Of them, the frames that it is solved from, spread evenly."""
+    min_frames: int = Field(5, ge=3)
+    """Frames with events before the first image is solved."""
+    min_flow: float = Field(1.5, gt=0)
+    """Pixels of brightness images that the scene must have moved before the first image is solved."""
+    solve_interval: int = Field(3, ge=1)
+    """At least this many frames lie between two solutions of one keyframe's image."""
+    silent_share: float = Field(0.02, ge=0, lt=1)
+    """Fewer events than this share of the usual number: the camera or the event stream has stopped."""
+    slowing_share: float = Field(0.2, ge=0, lt=1)
+    """Fewer events than this share in the frame before: the camera was coming to rest."""
+    silent_flow: float = Field(0.3, ge=0)
+    """Pixels of motion a frame from which a camera does not stop within one frame: events are missing."""
+    revisit_overlap: float = Field(0.6, gt=0, lt=1)
+    """Share of an old keyframe's pixels that must be in view again to close a loop."""
+    revisit_misfit: float = Field(0.12, gt=0)
+    """Median absolute difference of log brightness up to which two keyframes show the same place."""
+
+
+class TrackingConfig(Stage):
+    """Trackers of Sec. III-B: time surfaces (Eq. 5), images made of events, or both in turn."""
+
     brightness: bool = True
     """Align to log-brightness images made of events once there are some; False: time surfaces only."""
+    images: ImageTrackingConfig = ImageTrackingConfig()
     brightness_sigma: float = Field(0.15, gt=0)
-    """Standard deviation of a log-brightness residual."""
+    """Images: standard deviation of a log-brightness residual."""
+    num_patches: int = Field(400, ge=1)
+    """Time surfaces: patches per direction; 400 is the best row of Table II (the text says 200)."""
+    patch_size: int = Field(9, ge=1, le=31)
+    """Time surfaces: side p of a patch in pixels, odd (Table I)."""
+    min_time_surface: float = Field(0.3, ge=0, lt=1)
+    """Time surfaces: patch centres are drawn where the surface exceeds this (tau in Sec. III-B; no value
+    given there)."""
     references: Literal["previous", "keyframe", "both"] = "keyframe"
-    """Frames to align to: the last one (paper), the tracker's keyframe (less drift), or both."""
+    """Time surfaces: frames to align to: the last one (paper), the keyframe (less drift), or both."""
     directions: Literal["both", "forward"] = "both"
-    """Patches of the reference seen in the new frame (forward), and also the other way round (Eq. 5)."""
+    """Time surfaces: patches of the reference seen in the new frame (forward), and also the other way round
+    (Eq. 5)."""
     form: Literal["additive", "compositional"] = "additive"
-    """Jacobians of the view that patches are warped to, anew at each step (additive), or of the patches,
-    once (inverse compositional, Baker and Matthews 2004). Time surfaces only."""
+    """Time surfaces: Jacobians of the view that patches are warped to, anew at each step (additive), or of
+    the patches, once (inverse compositional, Baker and Matthews 2004)."""
     surface_sigma: float = Field(0.15, gt=0)
-    """Standard deviation of a time-surface residual."""
+    """Time surfaces: standard deviation of a residual."""
+    levels: int = Field(3, ge=1, le=6)
+    """Time surfaces: pyramid levels, coarse to fine."""
+    iterations: int = Field(20, ge=1)
+    """Time surfaces: at most this many Levenberg-Marquardt steps a level."""
+    max_depth_difference: float = Field(0.1, gt=0)
+    """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
     depth_weight: float = Field(3.0, ge=0)
-    """Weight of the depth residual beside the time surface; 0: Eq. 5 alone."""
+    """Weight of depth residuals beside those of time surfaces or images; 0: Eq. 5 alone."""
     depth_sigma: float = Field(0.003, gt=0)
     """Standard deviation of depth at short range, metres."""
     depth_sigma_2: float = Field(0.0019, ge=0)
     """Growth of the depth's standard deviation with depth squared, 1/m (Kinect: 0.0019)."""
     huber_threshold: float = Field(1.345, gt=0)
     """Residuals beyond this many standard deviations count linearly (Eq. 5 sums unsquared norms)."""
-    levels: int = Field(3, ge=1, le=6)
-    """Pyramid levels, coarse to fine."""
-    iterations: int = Field(20, ge=1)
-    """At most this many Levenberg-Marquardt steps a level."""
     min_overlap: float = Field(0.8, gt=0, lt=1)
-    """Below this fraction of patch pixels seen, the frame becomes the tracker's next keyframe."""
+    """Below this fraction of its pixels in view, a keyframe is replaced by the new frame."""
     min_inliers: float = Field(0.3, gt=0, lt=1)
-    """Below this fraction of patch pixels in agreement, tracking has failed."""
+    """Below this fraction of pixels in agreement, tracking has failed."""
 
 
 class KeyframeConfig(Stage):
@@ -192,8 +234,8 @@ class Config(Stage):
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
     dataset: str | None = None
-    """Input format: event_replica, rpg, builtin; omitted: EventReplica when found under the data folder, else
-    the built-in room."""
+    """Input format: event_replica, rpg, rgbd, builtin; omitted: found by the files under the data
+    folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
     method: str = "ed_slam"

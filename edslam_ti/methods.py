@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from edslam_ti.errors import DataError
+
 if TYPE_CHECKING:  # a method's parts load Taichi or Open3D, which `--help` need not wait for
     from edslam_ti.config import Config
     from edslam_ti.datasets import EventDepthSequence
@@ -26,6 +28,11 @@ class Method:
 def _ed_slam(
     sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
+    if not sequence.has_events:
+        raise DataError(
+            f"{sequence.scene}: method {config.method} needs events, and this sequence has none; use "
+            "--method open3d_rgbd or open3d_icp"
+        )
     from edslam_ti.event_images.sharp import SharpImages
     from edslam_ti.mapping.gaussian_mapper import GaussianMapper
     from edslam_ti.tracking.image_tracker import BrightnessTracker

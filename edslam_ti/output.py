@@ -1,4 +1,7 @@
-"""Outputs that appear whole or not at all: written under a temporary name, then renamed."""
+"""Outputs that appear whole or not at all: written under a temporary name, then renamed.
+
+And the header of a .npy file whose number of rows is known only after the last one.
+"""
 
 import os
 import shutil
@@ -6,6 +9,9 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
 
 
 @contextmanager
@@ -40,3 +46,14 @@ def atomic_folder(path: Path) -> Iterator[Path]:
             os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_npy_header(file: BinaryIO, dtype: np.dtype, num_rows: int, num_columns: int) -> None:
+    """Write the header of an array [num_rows, num_columns] at the start of a .npy file.
+
+    Rows are appended behind it. NumPy pads the header so that a later call with their true number takes
+    the same space.
+    """
+    file.seek(0)
+    header = {"descr": dtype.str, "fortran_order": False, "shape": (num_rows, num_columns)}
+    np.lib.format.write_array_header_1_0(file, header)

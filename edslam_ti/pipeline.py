@@ -13,18 +13,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from edslam_ti import kernels
 from edslam_ti.config import Config
-from edslam_ti.datasets import EventDepthSequence, SampledSequence, open_sequence
+from edslam_ti.datasets import EventDepthSequence, SampledSequence, find_sequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation.images import ate_rmse_cm
+from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.memory import release_free_memory
 from edslam_ti.methods import METHODS
-from edslam_ti.results.folder import Run, save
-from edslam_ti.results.plots import StubViewer, Viewer
+from edslam_ti.results.folder import save
+from edslam_ti.results.run import Run
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import Tracker, TruePoses
+from edslam_ti.viewer import VIEWERS, Viewer
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 
@@ -40,7 +41,7 @@ def run(config: Config, console: Console | None = None) -> Path:
         kernels.init(config.device, threads=config.threads)
     except RuntimeError as error:  # no such device
         raise EdSlamError(str(error)) from error
-    viewer = Viewer() if config.visualize else StubViewer()
+    viewer = VIEWERS["open3d" if config.visualize else "none"]()
     state = _prepare(config)
     camera, (first, last) = state.sequence.camera, state.samples.timestamps[[0, -1]]
     state.note(f"{state.sequence.scene}: {state.sequence.description}, method {config.method}")
@@ -68,7 +69,7 @@ def run(config: Config, console: Console | None = None) -> Path:
 
 
 def _prepare(config: Config) -> Run:
-    sequence = open_sequence(config)
+    sequence = open_recording(config)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     contrast = contrast_of(config, sequence, samples)
     return Run(
@@ -79,6 +80,17 @@ def _prepare(config: Config) -> Run:
         held_out_frames(samples, config.evaluation.hold_out_every),
         contrast,
     )
+
+
+def open_recording(config: Config) -> EventDepthSequence:
+    """Open the scene that the settings name; without --dataset, print which one that turned out to be."""
+    if config.dataset is None:
+        folder = find_sequence(config).folder
+        where = (
+            f"the recording in {folder}" if folder else f"none in {config.data_dir}, so the built-in stand-in"
+        )
+        print(f"scene {config.scene}: {where}", flush=True)
+    return open_sequence(config)
 
 
 def make_slam(
@@ -151,7 +163,7 @@ def _progress(console: Console) -> Progress:
     )
 
 
-def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", console: Console) -> None:
+def _process(state: Run, interrupt: _Interrupt, viewer: Viewer, console: Console) -> None:
     slam, mapper = state.slam, state.slam.mapper
     with _progress(console) as bar:
         task = bar.add_task("mapping" if mapper else "tracking", total=len(state.samples), status="")

@@ -1,7 +1,7 @@
 """ED-SLAM as in Fig. 1 of the paper: events and depth in, trajectory and map out."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,8 +38,10 @@ class Slam:
         started = time.perf_counter()
         guess = self.trajectory.at(frame.timestamp) if len(self.trajectory) else self.initial_pose
         result = self.tracker.track(frame, guess, self.trajectory)  # Eq. 1-5
+        for index, T_world_camera in result.corrections.items():  # a loop closed, motion smoothed
+            self.trajectory.replace(index, T_world_camera)
         self.trajectory.append(frame.timestamp, result.T_world_camera)
-        self.results.append(result)
+        self.results.append(replace(result, corrections={}))  # they are on the trajectory: not kept twice
         tracked = time.perf_counter()
         if self.mapper is not None:
             self.mapper.update(frame, self.trajectory)  # Eq. 6-16

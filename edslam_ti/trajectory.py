@@ -112,6 +112,31 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
+class PathDraft:
+    """A trajectory with one more pose at its end, and corrections that are not on it yet."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.newest = np.eye(4)  # T_world_camera of the frame after the trajectory's last
+        self.corrections: dict[int, np.ndarray] = {}  # [4, 4] T_world_camera by index
+
+    def __len__(self) -> int:
+        return len(self.trajectory) + 1
+
+    def pose(self, index: int) -> np.ndarray:  # [4, 4]
+        """Return a frame's pose as it is corrected; `index` counts from the first frame."""
+        if index == len(self.trajectory):
+            return self.newest
+        return self.corrections[index] if index in self.corrections else self.trajectory.pose(index)
+
+    def replace(self, index: int, T_world_camera: np.ndarray) -> None:
+        """Correct a frame's pose."""
+        if index == len(self.trajectory):
+            self.newest = T_world_camera
+        else:
+            self.corrections[index] = T_world_camera
+
+
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world)."""
     with atomic_file(path) as temporary, temporary.open("w") as file:

@@ -9,7 +9,7 @@ import numpy as np
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, Sample
-from edslam_ti.evaluation.images import trajectory_errors
+from edslam_ti.evaluation.trajectories import trajectory_errors
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.events import Events
 from edslam_ti.frame import FrameBuilder
@@ -103,3 +103,21 @@ def without_events(sample: Sample) -> Sample:
 
 def without_depth(sample: Sample) -> Sample:
     return replace(sample, depth=None)
+
+
+def there_and_back(samples: list[Sample]) -> list[Sample]:
+    """Return a recording that goes back on its own path: events in reverse, with the other polarity."""
+    end = samples[-1].timestamp
+    result = list(samples)
+    for before, after in zip(samples[-2::-1], samples[:0:-1]):
+        x, y, t, polarity = (
+            a[::-1] for a in (after.events.x, after.events.y, after.events.t, after.events.polarity)
+        )
+        events = Events(x.copy(), y.copy(), 2 * end - t, -polarity)
+        result.append(replace(before, timestamp=2 * end - before.timestamp, events=events))
+    return result
+
+
+def with_depth_scaled(sample: Sample, factor: float) -> Sample:
+    assert sample.depth is not None
+    return replace(sample, depth=sample.depth * np.float32(factor))

@@ -36,28 +36,21 @@ ORDERS: dict[str, list[str]] = {
     ],
     "event_images": ["solve", "start_image", "contrast", "sharp"],
     "tracking": [
-        *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "place_recognition"),
-        *("pose_graph", "image_tracker"),
+        *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "smoothing", "gaps"),
+        *("place_recognition", "pose_graph", "loop_closure", "image_tracker"),
     ],
     "mapping": [
+        "gaussian_ply",
         *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
         *("targets", "poses", "gaussian_mapper"),
     ],
-    "evaluation": ["images", "meshes"],
-    "results": ["pictures", "export", "maps", "plots", "folder"],
+    "evaluation": ["trajectories", "lpips", "images", "meshes"],
+    "results": [
+        *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
+    ],
     "experiments": [
-        *(
-            "cases",
-            "selection",
-            "recordings",
-            "runs",
-            "ablations",
-            "report",
-            "long_stream",
-            "kernel_times",
-            "steps",
-        ),
-        "command",
+        *("cases", "selection", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times"),
+        *("steps", "command"),
     ],
 }
 
@@ -91,7 +84,7 @@ USES_OPEN3D = [
         "mapping.insertion",
         "mapping.volume",
     ),
-    *("baselines", "results"),
+    *("baselines", "results", "viewer"),
 ]
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
 HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,9 @@ from edslam_ti.camera import Camera
 from edslam_ti.command_line import launch, parse_config
 from edslam_ti.commands import run
 from edslam_ti.config import Config
-from edslam_ti.datasets import open_sequence
 from edslam_ti.errors import EdSlamError
 from edslam_ti.methods import METHODS
+from edslam_ti.pipeline import open_recording
 
 ROOT = Path(__file__).parents[1]
 APP = ROOT / "apps" / "slam.py"
@@ -44,7 +43,7 @@ def data(tmp_path: Path) -> Path:
 
 
 def open_asked(*arguments: str) -> Any:
-    return open_sequence(parse_config(arguments))
+    return open_recording(parse_config(arguments))
 
 
 def failure(capsys: pytest.CaptureFixture[str], act: Callable[[], Any]) -> tuple[int, str]:
@@ -139,9 +138,9 @@ def test_event_replica_is_used_where_it_is_found_and_said(
 def test_built_in_room_stands_in_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stand_in = ModuleType("edslam_ti.datasets.builtin")
-    stand_in.builtin_sequence_folder = lambda scene: write_sequence(tmp_path / scene)  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "edslam_ti.datasets.builtin", stand_in)
+    monkeypatch.setattr(
+        "edslam_ti.datasets.builtin.builtin_sequence_folder", lambda scene: write_sequence(tmp_path / scene)
+    )
     sequence = open_asked("--scene", "room2", "--data-dir", str(tmp_path / "nowhere"))
     assert (sequence.dataset, sequence.scene) == ("builtin", "room2")
     assert "built-in stand-in" in capsys.readouterr().out

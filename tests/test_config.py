@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from edslam_ti.config import Config, read_differences
-from edslam_ti.datasets import DATASETS
+from edslam_ti.datasets import FORMATS
 from edslam_ti.errors import ConfigError
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -20,7 +20,7 @@ def test_saved_settings_load_as_the_same_settings(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
 def test_each_dataset_file_is_valid_and_states_only_differences(path: Path) -> None:
     differences = read_differences(path)
-    assert path.stem in {*DATASETS, "builtin"}
+    assert path.stem in FORMATS
     defaults = Config().model_dump()
 
     def check(values: dict[str, object], base: dict[str, object]) -> None:

@@ -3,9 +3,10 @@
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from edslam_ti.output import atomic_file, atomic_folder
+from edslam_ti.output import atomic_file, atomic_folder, write_npy_header
 
 
 class Interruption(BaseException):
@@ -95,3 +96,14 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
         thread.join()
     assert path.read_text() in ("a" * 1000, "b" * 1000)
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_rows_of_a_npy_file_are_counted_afterwards(tmp_path: Path) -> None:
+    dtype = np.dtype("<f4")
+    with (tmp_path / "rows.npy").open("wb") as file:
+        write_npy_header(file, dtype, 0, 2)
+        start = file.tell()
+        np.arange(6, dtype=dtype).tofile(file)
+        write_npy_header(file, dtype, 3, 2)
+        assert file.tell() == start
+    np.testing.assert_array_equal(np.load(tmp_path / "rows.npy"), np.arange(6).reshape(3, 2))

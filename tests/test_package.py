@@ -11,7 +11,7 @@ import pytest
 
 import edslam_ti
 from edslam_ti.config import CONFIGS, Config, dataset_differences
-from edslam_ti.datasets import DATASETS
+from edslam_ti.datasets import FORMATS
 from edslam_ti.methods import METHODS
 
 ROOT = Path(__file__).parents[1]
@@ -61,7 +61,7 @@ def test_extras_that_messages_name_are_there() -> None:
 
 def test_help_names_every_data_set() -> None:
     description = Config.model_fields["dataset"].description or ""
-    assert {"builtin", *DATASETS} <= set(re.findall(r"\w+", description))
+    assert set(FORMATS) <= set(re.findall(r"\w+", description))
 
 
 def test_every_method_has_a_description() -> None:

@@ -1,5 +1,7 @@
 """The loop: any tracker and any mapper over one trajectory."""
 
+from dataclasses import replace
+
 import numpy as np
 from sequences import make_slam, settings
 
@@ -50,6 +52,22 @@ def test_lost_frames_are_counted_and_do_not_end_the_run() -> None:
     slam, _ = run()
     assert [result.converged for result in slam.results] == [True, True, False, True]
     assert slam.tracking_seconds > 0
+
+
+def test_corrections_of_a_tracker_reach_the_trajectory_but_not_what_was_tracked() -> None:
+    class Hindsight(Follower):
+        def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+            result = super().track(frame, guess, trajectory)
+            better = result.T_world_camera.copy()
+            better[1, 3] = 0.5
+            return replace(result, corrections={1: better} if len(trajectory) == 3 else {})
+
+    slam = Slam(FrameBuilder(CAMERA), Hindsight(), None, np.eye(4))
+    for k in range(4):
+        slam.process(Sample(0.1 * k, Events.empty(), depth=None))
+    assert [T[1, 3] for T in slam.trajectory.poses] == [0, 0.5, 0, 0]
+    assert [T[1, 3] for T in slam.frontend_trajectory.poses] == [0, 0, 0, 0]
+    assert all(not r.corrections for r in slam.results)  # not kept twice
 
 
 def test_mapper_gets_every_frame_after_its_pose_and_knows_what_is_held_out() -> None:

@@ -1,7 +1,7 @@
 """KISS-ICP on the points of the depth images, where the package `kiss-icp` is installed.
 
-Vizzo et al. 2023, the authors' own code (the extra `kiss`). It is made for lidars: its settings here
-are scaled to rooms, and it has no motion prior but its own, so that frames without depth are predicted.
+Vizzo et al. 2023, the authors' own code (the extra `kiss`). It is made for lidars; the settings here
+are scaled to rooms. It sees depth images only, so the poses of frames without depth are predicted.
 """
 
 from typing import Any

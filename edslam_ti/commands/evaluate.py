@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = read_options(EvaluateOptions, argv, "edslam evaluate", __doc__)
     if (options.mesh is None) != (options.recording is None):
         raise UsageError("--mesh and --recording: expected both or neither; give the missing one")
-    from edslam_ti.evaluation.images import statistics, trajectory_errors
+    from edslam_ti.evaluation.trajectories import statistics, trajectory_errors
     from edslam_ti.trajectory import read_tum
 
     estimate = read_tum(options.estimate)

@@ -27,7 +27,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = read_options(ViewOptions, argv, "edslam view", __doc__)
     if options.save is not None and options.save.suffix.lower() != ".png":
         raise UsageError(f"--save: expected a file name that ends in .png, got {options.save}")
-    from edslam_ti.results.plots import draw_results, show_results  # slow to load
+    from edslam_ti.results.plots import draw_results  # slow to load
+    from edslam_ti.results.window import show_results
 
     if options.save is None:
         show_results(options.results)

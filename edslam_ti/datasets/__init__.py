@@ -1,109 +1,191 @@
-"""Sequences on disk: one file per format, one dictionary of formats, one function that opens them."""
+"""Sequences on disk: one file per format, one dictionary of formats, functions that find and open a scene.
+
+To add a data set:
+
+1. Write `datasets/<name>.py` with a subclass of `EventDepthSequence` (base.py). Its constructor takes the
+   folder of one scene, sets every attribute of the base class and checks what it can see of the files.
+   files.py reads tables, images and depth; event_file.py reads events slice by slice.
+2. Add a line to `FORMATS`: how a folder is opened, how it is recognised, one line about the layout.
+   `--dataset <name>`, automatic detection and the lists in error messages follow from that line.
+3. Write `configs/<name>.yaml` if the sensor needs settings that differ from the defaults.
+4. Test the loader on small files that the test writes in the published layout, as tests/datasets do.
+"""
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from edslam_ti.config import Config
-from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence
+from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence, WrappedSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
-from edslam_ti.datasets.rpg import RpgSequence
+from edslam_ti.datasets.rgbd import RgbdSequence, is_rgbd
+from edslam_ti.datasets.rpg import RpgSequence, is_rpg
 from edslam_ti.errors import ConfigError
 
-__all__ = ["DATASETS", "EventDepthSequence", "Sample", "SampledSequence", "find_sequence", "open_sequence"]
+__all__ = [
+    "FORMATS",
+    "EventDepthSequence",
+    "Format",
+    "Found",
+    "Sample",
+    "SampledSequence",
+    "WrappedSequence",
+    "find_sequence",
+    "open_sequence",
+]
 
-# What --dataset chooses from: format -> sequence in a folder. `builtin` sequences are EventReplica's
-# layout too; `open_sequence` makes them on first use.
-DATASETS: dict[str, Callable[[Path, Config], EventDepthSequence]] = {
-    "event_replica": lambda folder, config: EventReplicaSequence(folder, config.contrast_threshold),
-    "rpg": lambda folder, config: RpgSequence(folder),
+
+@dataclass(frozen=True)
+class Format:
+    """A layout of files that sequences come in."""
+
+    description: str  # what tells a folder of it, for messages
+    open: Callable[[Path, Config], EventDepthSequence]  # from the folder of one scene
+    detect: Callable[[Path], bool]  # whether a folder holds such a sequence
+    scenes: Callable[[], Sequence[str]] = tuple  # scenes that need no data, which `make` makes
+    make: Callable[[str], Path] | None = None  # their folder by the scene's name, made on first use
+
+
+class Found(NamedTuple):
+    """Where a scene was found."""
+
+    dataset: str  # key of FORMATS
+    folder: Path | None  # None: built in, made when it is opened
+
+
+def _builtin_scenes() -> Sequence[str]:
+    from edslam_ti.simulation.catalogue import SCENE_NAMES
+
+    return SCENE_NAMES
+
+
+def _open_builtin(folder: Path, config: Config) -> EventDepthSequence:
+    from edslam_ti.datasets.builtin import BuiltinSequence
+
+    return BuiltinSequence(folder, config.contrast_threshold)
+
+
+def _make_builtin(scene: str) -> Path:
+    from edslam_ti.datasets.builtin import builtin_sequence_folder
+
+    return builtin_sequence_folder(scene)
+
+
+# What --dataset chooses from. Without it, a recording in the first of them comes before all others, and any
+# recording before a built-in room.
+FORMATS: dict[str, Format] = {
+    "event_replica": Format(
+        "EventReplica's layout, with event_threshold_<C>/gray_events_data.npy",
+        lambda folder, config: EventReplicaSequence(folder, config.contrast_threshold),
+        is_event_replica,
+    ),
+    "rpg": Format(
+        "RPG Event Camera Dataset's layout, with events.txt",
+        lambda folder, config: RpgSequence(folder),
+        is_rpg,
+    ),
+    "rgbd": Format(
+        "layouts of TUM RGB-D, of NICE-SLAM's Replica and of 7-Scenes, without events",
+        lambda folder, config: RgbdSequence(folder),
+        is_rgbd,
+    ),
+    "builtin": Format(
+        "simulated rooms, made on first use",
+        _open_builtin,
+        lambda folder: False,  # their layout is EventReplica's
+        _builtin_scenes,
+        _make_builtin,
+    ),
 }
 
 
-def find_sequence(config: Config) -> tuple[str, Path | None]:
-    """Return the format and the folder of a scene; a built-in room has no folder yet.
+def find_sequence(config: Config) -> Found:
+    """Return the format and the folder of the scene that the settings name.
 
-    Without --dataset, EventReplica's recording under the data folder comes before the built-in room.
+    Raises `ConfigError` for an unknown data set, an unknown scene, and a folder that is in no known layout
+    or in several.
     """
-    folder = _scene_folder(config)
-    if config.dataset in DATASETS:
-        if folder is None:
-            raise _not_found(config)
-        return config.dataset, folder
-    if config.dataset is None and folder is not None and is_event_replica(folder):
-        return "event_replica", folder
-    from edslam_ti.simulation.catalogue import SCENE_NAMES
-
-    if config.scene in SCENE_NAMES:
-        return "builtin", None
-    raise _not_found(config)
+    if config.dataset is not None:
+        return _find_in(config, config.dataset)
+    for folder in _folders(config):
+        names = [name for name, format in FORMATS.items() if format.detect(folder)]
+        if len(names) > 1:
+            raise ConfigError(f"{folder}: looks like {' and like '.join(names)}; choose one with --dataset")
+        if names:
+            return Found(names[0], folder)
+    for name, format in FORMATS.items():
+        if config.scene in format.scenes():
+            return Found(name, None)
+    raise _not_found(config, FORMATS)
 
 
 def open_sequence(config: Config) -> EventDepthSequence:
-    """Open the scene that the settings name; without --dataset, print which one that turned out to be."""
-    dataset, folder = find_sequence(config)
-    if config.dataset is None:
-        where = (
-            f"the recording in {folder}" if folder else f"none in {config.data_dir}, so the built-in stand-in"
-        )
-        print(f"scene {config.scene}: {where}", flush=True)
-    if folder is not None:
-        return DATASETS[dataset](folder, config)
-    from edslam_ti.datasets.builtin import builtin_sequence_folder
-    from edslam_ti.simulation.catalogue import ROOM_NAMES
+    """Open the scene that the settings name; a built-in one is simulated on first use (Taichi must run).
 
-    description = f"built-in simulated room '{config.scene}', a stand-in for EventReplica's scene"
-    sequence = EventReplicaSequence(
-        builtin_sequence_folder(config.scene),
-        config.contrast_threshold,
-        description=description if config.scene in ROOM_NAMES else None,  # others describe themselves
-    )
-    sequence.dataset, sequence.scene = "builtin", config.scene
-    return sequence
+    Raises what `find_sequence` raises, and `DataError` or `FileNotFoundError` for files that cannot be used.
+    """
+    found = find_sequence(config)
+    format = FORMATS[found.dataset]
+    folder = found.folder
+    if folder is None:
+        assert format.make is not None, f"{found.dataset}: has scenes but no way to make them"
+        folder = format.make(config.scene)
+    return format.open(folder, config)
 
 
-def _scene_folder(config: Config) -> Path | None:
-    for parent in (config.data_dir / (config.dataset or "event_replica"), config.data_dir):
-        if (parent / config.scene).is_dir():
-            return parent / config.scene
-    return None
+def _find_in(config: Config, dataset: str) -> Found:
+    if dataset not in FORMATS:
+        close = difflib.get_close_matches(dataset, FORMATS, n=1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        raise ConfigError(f"dataset: expected one of {', '.join(FORMATS)}, got '{dataset}'{hint}")
+    format = FORMATS[dataset]
+    built_in = format.scenes()
+    if config.scene in built_in:
+        return Found(dataset, None)
+    if built_in:
+        raise ConfigError(f"no built-in room '{config.scene}'; there are {', '.join(built_in)}")
+    # Any folder of that name: its loader says best what is missing in it.
+    for folder in _folders(config):
+        return Found(dataset, folder)
+    raise _not_found(config, {dataset: format})
 
 
-def _not_found(config: Config) -> ConfigError:
-    """Say what there is instead."""
-    from edslam_ti.simulation.catalogue import SCENE_NAMES
+def _parents(config: Config) -> list[Path]:
+    """Return the folders that may hold sequences: <data_dir>/<dataset> of every data set, and data_dir."""
+    names = list(FORMATS) if config.dataset is None else [config.dataset]
+    return [*(config.data_dir / name for name in names), config.data_dir]
 
+
+def _folders(config: Config) -> Iterator[Path]:
+    """Yield the folders that carry the scene's name."""
+    return (parent / config.scene for parent in _parents(config) if (parent / config.scene).is_dir())
+
+
+def _not_found(config: Config, formats: dict[str, Format]) -> ConfigError:
+    """Say what there is instead, of the formats that were looked for."""
     wanted = f"scene '{config.scene}' not found in {config.data_dir}"
-    if config.dataset == "builtin":
-        return ConfigError(f"no built-in room '{config.scene}'; there are {', '.join(SCENE_NAMES)}")
     if not config.data_dir.is_dir():
         wanted += " (there is no such folder)"
-    elif is_event_replica(config.data_dir) or (config.data_dir / "events.txt").is_file():
+    elif any(format.detect(config.data_dir) for format in FORMATS.values()):
         name = config.data_dir.resolve()
         return ConfigError(
             f"{wanted}, which is itself a sequence; use --data-dir {name.parent} --scene {name.name}"
         )
-    folder = _scene_folder(config)
-    if config.dataset is None and folder is not None:
-        hint = "; it looks like --dataset rpg" if (folder / "events.txt").is_file() else ""
-        return ConfigError(f"{folder}: no event_threshold_<C> folder as in EventReplica's layout{hint}")
-    there = _scenes_in(config)
-    choices = there + ([] if config.dataset else list(SCENE_NAMES))
-    close = difflib.get_close_matches(config.scene, choices, n=1)
+    for folder in _folders(config):
+        known = "; ".join(f"{name} ({f.description})" for name, f in formats.items() if not f.scenes())
+        return ConfigError(f"{folder}: in no known layout; expected one of {known}")
+    recorded = _recorded_scenes(config, formats)
+    built_in = [scene for format in formats.values() for scene in format.scenes()]
+    close = difflib.get_close_matches(config.scene, [*recorded, *built_in], n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
-    found = f"sequences there: {', '.join(there) or 'none'}"
-    builtin = "" if config.dataset else f"; built-in rooms: {', '.join(SCENE_NAMES)}"
-    return ConfigError(f"{wanted}{hint}; {found}{builtin}")
+    found = f"sequences there: {', '.join(recorded) or 'none'}"
+    rooms = f"; built-in rooms: {', '.join(built_in)}" if built_in else ""
+    return ConfigError(f"{wanted}{hint}; {found}{rooms}")
 
 
-def _scenes_in(config: Config) -> list[str]:
-    """Return the names of the folders that hold a sequence of the wanted format."""
-    names = set()
-    for parent in (config.data_dir / (config.dataset or "event_replica"), config.data_dir):
-        for folder in parent.iterdir() if parent.is_dir() else []:
-            wanted = (
-                (folder / "events.txt").is_file() if config.dataset == "rpg" else is_event_replica(folder)
-            )
-            if folder.is_dir() and wanted:
-                names.add(folder.name)
-    return sorted(names)
+def _recorded_scenes(config: Config, formats: dict[str, Format]) -> list[str]:
+    """Return the names of the folders that hold a sequence of one of the formats."""
+    folders = [f for parent in _parents(config) if parent.is_dir() for f in parent.iterdir() if f.is_dir()]
+    return sorted({f.name for f in folders if any(format.detect(f) for format in formats.values())})

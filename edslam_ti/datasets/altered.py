@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edslam_ti.datasets import EventDepthSequence
+from edslam_ti.datasets.base import EventDepthSequence, NovelView, WrappedSequence
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 from edslam_ti.simulation.depth_noise import kinect_depth, viewing_cosine
@@ -14,7 +14,7 @@ Gap = tuple[float, float]  # seconds from the sequence's clock, start and length
 SAME_POSE = 1e-3  # metres, entries of rotation matrices
 
 
-class AlteredSequence(EventDepthSequence):
+class AlteredSequence(WrappedSequence):
     """A sequence with exact depth, altered while it is read; the recording on disk stays as it is.
 
     `noise` "kinect" adds a structured-light camera's noise, the same for one `seed`. `depth_rate` (Hz)
@@ -32,17 +32,10 @@ class AlteredSequence(EventDepthSequence):
     ) -> None:
         if noise not in ("none", "kinect"):
             raise DataError(f"depth noise: expected none or kinect, got '{noise}'")
-        self._sequence = sequence
+        super().__init__(sequence)
         self._noise = noise
         self._seed = seed
         self._event_gap = event_gap
-        self.dataset, self.scene, self.camera = sequence.dataset, sequence.scene, sequence.camera
-        self.contrast_threshold = sequence.contrast_threshold
-        self.truth = sequence.truth
-        self.image_timestamps = sequence.image_timestamps
-        self.description = sequence.description
-        self.surfaces_file = sequence.surfaces_file
-        self.time_offset = sequence.time_offset
         stamps = sequence.depth_timestamps
         kept = _thinned(stamps, depth_rate)
         if depth_gap is not None:
@@ -51,10 +44,6 @@ class AlteredSequence(EventDepthSequence):
             kept = kept[(times < start) | (times >= start + length)]
         self._kept = kept  # [D] indices of depth images
         self.depth_timestamps = stamps[kept]
-
-    @property
-    def time_range(self) -> tuple[float, float]:
-        return self._sequence.time_range
 
     def events(self, start: float, end: float) -> Events:
         if self._event_gap is None:
@@ -76,11 +65,8 @@ class AlteredSequence(EventDepthSequence):
         rng = np.random.default_rng([self._seed, milliseconds])
         return kinect_depth(depth, viewing_cosine(depth, self.camera), self.camera, rng)
 
-    def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
-        return self._sequence.image(index)
 
-
-class RepeatedSequence(EventDepthSequence):
+class RepeatedSequence(WrappedSequence):
     """A recording that ends where it began, played several times on end: as long a stream as is wanted."""
 
     def __init__(self, sequence: EventDepthSequence, rounds: int) -> None:
@@ -91,10 +77,9 @@ class RepeatedSequence(EventDepthSequence):
                 f"{sequence.scene}: expected true poses that end where they begin, to play it again, got "
                 f"{'none' if truth is None else f'a difference of {apart:.3g}'}; record a loop (--path loop)"
             )
-        self._sequence = sequence
+        super().__init__(sequence)
+        self._start = float(truth.timestamps[0])
         self._period = float(truth.timestamps[-1] - truth.timestamps[0])
-        self.dataset, self.scene, self.camera = sequence.dataset, sequence.scene, sequence.camera
-        self.contrast_threshold = sequence.contrast_threshold
         self.description = f"{sequence.description}, {rounds} times on end"
         self._rounds = rounds
         self.depth_timestamps, self._depth = self._repeated(sequence.depth_timestamps)
@@ -111,8 +96,8 @@ class RepeatedSequence(EventDepthSequence):
         parts = []
         for k in range(self._rounds):
             shift, is_last = k * self._period, k == self._rounds - 1
-            until = end - shift if is_last else min(end - shift, self._period)
-            part = self._sequence.events(max(start - shift, 0.0) if k else start, until)
+            until = end - shift if is_last else min(end - shift, self._start + self._period)
+            part = self._sequence.events(max(start - shift, self._start) if k else start, until)
             parts.append(replace(part, t=part.t + shift))
         return Events.concatenate(parts)
 
@@ -121,6 +106,14 @@ class RepeatedSequence(EventDepthSequence):
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
         return self._sequence.image(int(self._image[index]))
+
+    def novel_views(self) -> list[NovelView]:
+        views = self._sequence.novel_views()
+        return [
+            replace(view, timestamp=view.timestamp + k * self._period)
+            for k in range(self._rounds)
+            for view in views
+        ]
 
     def _repeated(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [N] s -> [M] s, [M] indices
         """Return the stamps of all rounds, and which of the recording's each is."""

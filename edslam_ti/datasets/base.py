@@ -1,5 +1,6 @@
 """What every sequence offers, and how it is cut into samples."""
 
+import inspect
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -38,6 +39,9 @@ class NovelView:
 class EventDepthSequence(ABC):
     """Streams of events and depth, with images and true poses where the data has them.
 
+    Data of depth cameras alone has no events: `has_events` is False, `events` returns empty slices and
+    `time_range` is that of the depth images.
+
     Constructors validate what they can see without reading everything, and raise `DataError` or
     `FileNotFoundError`; reading methods raise `DataError` on what only then shows.
     """
@@ -52,6 +56,7 @@ class EventDepthSequence(ABC):
     exposure: float | None = None  # seconds over which an image integrates, when the data states it
     description: str  # one line: what this is; a stand-in says so
     surfaces_file: Path | None = None  # true surfaces of a simulated scene, a PLY mesh; for evaluation only
+    has_events: bool = True
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
 
     @abstractmethod
@@ -69,7 +74,7 @@ class EventDepthSequence(ABC):
     @property
     @abstractmethod
     def time_range(self) -> tuple[float, float]:
-        """Times of the first and the last event in seconds."""
+        """Times of the first and the last event in seconds; of depth images where there are no events."""
 
     def novel_views(self) -> list[NovelView]:
         """Return the true views beside the path, in the order of time; data without any has none."""
@@ -89,6 +94,36 @@ class EventDepthSequence(ABC):
         return self.truth.at(timestamp)
 
 
+class WrappedSequence(EventDepthSequence):
+    """A sequence that shows another one; subclasses override what they change.
+
+    Every attribute of `EventDepthSequence` is taken over when the wrapper is made, so that none can be
+    forgotten when one is added. Methods pass the call on. `image_at` and `true_pose` do not: they follow
+    from what the wrapper itself shows.
+    """
+
+    def __init__(self, sequence: EventDepthSequence) -> None:
+        self._sequence = sequence
+        for name in inspect.get_annotations(EventDepthSequence):
+            setattr(self, name, getattr(sequence, name))
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        return self._sequence.time_range
+
+    def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+        return self._sequence.depth(index)
+
+    def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
+        return self._sequence.image(index)
+
+    def events(self, start: float, end: float) -> Events:
+        return self._sequence.events(start, end)
+
+    def novel_views(self) -> list[NovelView]:
+        return self._sequence.novel_views()
+
+
 MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface shows something
 
 
@@ -97,7 +132,7 @@ class SampledSequence:
 
     `start` counts from the first event or depth image, whichever is earlier, so that a recording cut out
     of a longer one needs no other numbers. A sample ends at every depth image; gaps longer than
-    `max_interval` are divided evenly by samples without depth.
+    `max_interval` are divided evenly by samples without depth, unless there are no events to track then.
     """
 
     def __init__(
@@ -112,19 +147,20 @@ class SampledSequence:
         stamps = sequence.depth_timestamps
         begin = min([first, *stamps[:1]]) + start
         end = np.inf if duration is None else begin + duration
-        # Depth outside the event stream has nothing to be tracked with.
         inside = stamps[(stamps >= begin - 1e-9) & (stamps <= end + 1e-9)]
-        inside = inside[(inside >= first + MIN_HISTORY) & (inside <= last + max_interval)]
+        if sequence.has_events:  # depth outside their stream has nothing to be tracked with
+            inside = inside[(inside >= first + MIN_HISTORY) & (inside <= last + max_interval)]
         if len(inside) < 2:
             depth_range = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else "nothing"
+            events_range = f"{first:.3f} to {last:.3f} s" if sequence.has_events else "nothing"
             raise DataError(
                 f"{sequence.scene}: expected at least 2 depth images between {begin:.3f} s and "
                 f"{min(end, last):.3f} s, got {len(inside)}; depth covers {depth_range}, events "
-                f"{first:.3f} to {last:.3f} s; change --start or --duration (counted from the first of them)"
+                f"{events_range}; change --start or --duration (counted from the first of them)"
             )
         times, has_depth = [float(inside[0])], [True]
         for a, b in itertools.pairwise(inside):
-            pieces = int(np.ceil((b - a) / max_interval - 1e-6))
+            pieces = int(np.ceil((b - a) / max_interval - 1e-6)) if sequence.has_events else 1
             times += [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
             has_depth += [False] * (pieces - 1) + [True]
         self.timestamps = np.array(times)  # [S]

@@ -4,8 +4,9 @@ import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
+from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.datasets.files import cache_folder
-from edslam_ti.simulation import SimulationConfig, make_path, make_room, simulate
+from edslam_ti.simulation import ROOM_NAMES, SimulationConfig, make_path, make_room, simulate
 from edslam_ti.simulation.truth import write_evaluation_truth
 
 GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
@@ -13,6 +14,17 @@ GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that
 # Settings added after GENERATOR_VERSION was last raised: at their defaults they change nothing, and
 # recordings made before them stay valid.
 NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events")
+
+
+class BuiltinSequence(EventReplicaSequence):
+    """A built-in sequence in the folder that `builtin_sequence_folder` made."""
+
+    dataset = "builtin"
+
+    def __init__(self, folder: Path, contrast_threshold: float | None = None) -> None:
+        super().__init__(folder, contrast_threshold)
+        if self.scene in ROOM_NAMES:  # the others describe themselves
+            self.description = f"built-in simulated room '{self.scene}', a stand-in for EventReplica's scene"
 
 
 def builtin_sequence_folder(

@@ -61,6 +61,8 @@ class CameraFile(BaseModel):
     """Units of depth/*.png in a metre (1000: millimetres); below 1, metres in a unit (0.001: the same)."""
     exposure: float | None = Field(None, ge=0, lt=1)
     """Seconds over which an image integrates, centred on its time; 0: sharp."""
+    frame_rate: float = Field(30.0, gt=0)
+    """Images a second, for layouts whose files carry a number but no time (not EventReplica's)."""
     description: str | None = None
     """What the recording is; simulated ones say so here, and results repeat it."""
 
@@ -116,9 +118,7 @@ class EventReplicaSequence(EventDepthSequence):
 
     dataset = "event_replica"
 
-    def __init__(
-        self, folder: Path, contrast_threshold: float | None = None, description: str | None = None
-    ) -> None:
+    def __init__(self, folder: Path, contrast_threshold: float | None = None) -> None:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
@@ -126,7 +126,7 @@ class EventReplicaSequence(EventDepthSequence):
         surfaces = folder / "surfaces.ply"
         self.surfaces_file = surfaces if surfaces.is_file() else None
         calibration = read_camera(folder / "camera.json")
-        self.description = description or calibration.description or f"EventReplica layout, {folder}"
+        self.description = calibration.description or f"EventReplica layout, {folder}"
         self.camera = calibration.camera
         self.exposure = calibration.exposure
         self._metres_per_unit = calibration.metres_per_unit

@@ -42,6 +42,32 @@ def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, colu
     return rows
 
 
+def read_timed_paths(path: Path, use: str = "seconds") -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
+    """Return the times and files of a list of lines 't path'; paths start at the list's folder.
+
+    `use` says in a message what the lines are for.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} not found; expected lines 't path', {use}")
+    times: list[float] = []
+    files: list[Path] = []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            time, name = float(fields[0]), fields[1]
+        except (ValueError, IndexError) as error:
+            raise DataError(f"{path}: line {number}: expected 't path', got '{line}'") from error
+        if not np.isfinite(time) or (times and time <= times[-1]):
+            raise DataError(f"{path}: line {number}: expected increasing times in seconds, got {time}")
+        times.append(time)
+        files.append(path.parent / name)
+    if not files:
+        raise DataError(f"{path}: expected lines 't path', got an empty file")
+    return np.array(times), files
+
+
 def numbered_files(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Return the files of a folder by the last number in their names, in ascending order."""
     found: dict[int, Path] = {}

@@ -19,10 +19,9 @@ or is dropped.
 """
 
 import hashlib
-import sys
+import logging
 import warnings
 from pathlib import Path
-from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -38,16 +37,19 @@ from edslam_ti.datasets.files import (
     read_depth,
     read_image,
     read_numbers,
+    read_timed_paths,
 )
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
-from edslam_ti.output import atomic_file
+from edslam_ti.output import atomic_file, write_npy_header
 from edslam_ti.trajectory import Trajectory, read_tum
 
-DAVIS240C = (240, 180)  # width, height: the dataset's sensor, where no image tells
 TUM_DEPTH_SCALE = 5000.0  # PNG units in a metre
+EVENT_DTYPE = np.dtype("<f8")  # of the binary copy of events.txt
 ROWS_AT_A_TIME = 1_000_000
-SLOW_TO_PARSE = 200_000_000  # bytes of text: about ten seconds
+SLOW_TO_PARSE = 200_000_000  # bytes of text, about ten million events: several seconds
+
+logger = logging.getLogger(__name__)
 
 
 class RpgSequence(EventDepthSequence):
@@ -61,7 +63,7 @@ class RpgSequence(EventDepthSequence):
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
         K = read_numbers(folder / "calib.txt", 9, "fx fy cx cy k1 k2 p1 p2 k3")[0]
-        image_times, image_files = _read_image_list(folder)
+        image_times, image_files = read_timed_paths(folder / "images.txt", "which also give depth its times")
         depth, depth_folder = _depth_files(folder, len(image_times))
         width, height = image_size(image_files[0]) if image_files else image_size(next(iter(depth.values())))
         self.camera = Camera(width, height, *(float(v) for v in K[:4]))
@@ -142,30 +144,6 @@ class _EventUndistortion:
         return Events(x.astype(np.int16), y.astype(np.int16), events.t[event], events.polarity[event])
 
 
-def _read_image_list(folder: Path) -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
-    """Read images.txt."""
-    path = folder / "images.txt"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; expected lines 't path', which also give depth its times")
-    times: list[float] = []
-    files: list[Path] = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            time, name = float(fields[0]), fields[1]
-        except (ValueError, IndexError) as error:
-            raise DataError(f"{path}: line {number}: expected 't path', got '{line}'") from error
-        if not np.isfinite(time) or (times and time <= times[-1]):
-            raise DataError(f"{path}: line {number}: expected increasing times in seconds, got {time}")
-        times.append(time)
-        files.append(folder / name)
-    if not files:
-        raise DataError(f"{path}: expected lines 't path', got an empty file")
-    return np.array(times), files
-
-
 def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:
     """Return the depth images by the index of their time, and the name of their folder."""
     for name in ("depth", "derived_depth"):
@@ -198,7 +176,8 @@ def open_text_events(path: Path, width: int, height: int) -> EventFile:
     binary = cache_folder() / "events" / f"{path.parent.name}_{digest}.npy"
     if not binary.is_file():
         if status.st_size > SLOW_TO_PARSE:
-            print(f"reading {path} once ({status.st_size / 1e6:.0f} MB) ...", file=sys.stderr)
+            # A warning shows on stderr where the program has not set up logging: the user is made to wait.
+            logger.warning("reading %s once (%.0f MB) ...", path, status.st_size / 1e6)
         with atomic_file(binary) as temporary:
             _parse_events(path, temporary)
     return EventFile(binary, width, height, name=str(path), first_row=1)
@@ -209,7 +188,7 @@ def _parse_events(text: Path, binary: Path) -> None:
     count = 0
     with text.open() as source, binary.open("wb") as target, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # no rows left: the loop's end
-        _write_header(target, 0)
+        write_npy_header(target, EVENT_DTYPE, 0, 4)
         while True:
             try:
                 rows = np.loadtxt(source, max_rows=ROWS_AT_A_TIME, comments=None, ndmin=2)
@@ -221,17 +200,15 @@ def _parse_events(text: Path, binary: Path) -> None:
                 break
             if rows.shape[1] != 4:
                 raise DataError(f"{text}: expected 4 numbers a line 't x y p', got {rows.shape[1]}")
-            rows[:, [1, 2, 0, 3]].astype("<f8").tofile(target)
+            rows[:, [1, 2, 0, 3]].astype(EVENT_DTYPE).tofile(target)
             count += len(rows)
             if len(rows) < ROWS_AT_A_TIME:
                 break
         if count == 0:
             raise DataError(f"{text}: expected lines 't x y p', got an empty file")
-        target.seek(0)
-        _write_header(target, count)
+        write_npy_header(target, EVENT_DTYPE, count, 4)
 
 
-def _write_header(file: BinaryIO, count: int) -> None:
-    """Write the .npy header; NumPy pads it so that the number of rows can be rewritten in place."""
-    header = {"descr": "<f8", "fortran_order": False, "shape": (count, 4)}
-    np.lib.format.write_array_header_1_0(file, header)
+def is_rpg(folder: Path) -> bool:
+    """Return whether a folder holds events where this layout has them."""
+    return (folder / "events.txt").is_file()

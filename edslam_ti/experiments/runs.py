@@ -18,7 +18,7 @@ from edslam_ti.config import Config, dataset_differences
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.datasets.altered import AlteredSequence
 from edslam_ti.errors import ConfigError, EdSlamError
-from edslam_ti.evaluation.images import trajectory_errors
+from edslam_ti.evaluation.trajectories import trajectory_errors
 from edslam_ti.experiments.cases import MEASURED, Case, Recording
 from edslam_ti.experiments.recordings import Recordings
 from edslam_ti.methods import METHODS

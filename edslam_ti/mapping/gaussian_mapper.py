@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from edslam_ti.event_images.sharp import SharpImages
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import is_near, orthonormalized, se3_exp
 from edslam_ti.mapping.densification import Densifier
+from edslam_ti.mapping.gaussian_ply import write_gaussian_ply
 from edslam_ti.mapping.gaussians import GaussianMap
 from edslam_ti.mapping.insertion import beside_steps, depth_to_points, surface_discs, with_holes_filled
 from edslam_ti.mapping.keyframes import Keyframe, is_keyframe
@@ -211,6 +213,36 @@ class GaussianMapper:
         with torch.no_grad():
             gaussians = self.gaussians.activated()
         return gaussians.means.detach().numpy(), gaussians.colors.numpy()[:, 0]
+
+    @property
+    def map(self) -> GaussianMap:
+        """The Gaussians."""
+        return self.gaussians
+
+    def keyframe_indices(self) -> list[int]:
+        """Return the frames chosen as keyframes."""
+        return [keyframe.index for keyframe in self.keyframes]
+
+    def metrics(self) -> dict[str, int | float | None]:
+        """Return the numbers of keyframes, of steps taken, and of pixels that fire by themselves."""
+        return {
+            "num_keyframes": len(self.keyframes),
+            "num_mapping_steps": self.num_steps,
+            "num_hot_pixels": int(self.images.hot.sum()),
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write map.ply, the Gaussians in the layout of 3D Gaussian splatting."""
+        raw = {name: value.detach().numpy() for name, value in self.gaussians.raw.items()}
+        colors = self.gaussians.activated().colors.detach().numpy()
+        write_gaussian_ply(
+            folder / "map.ply",
+            raw["means"],
+            raw["quats"],
+            raw["log_scales"],
+            raw["logit_opacities"],
+            colors,
+        )
 
     # --- growing ---
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import torch
 
 from edslam_ti.config import MappingConfig
+from edslam_ti.mapping.gaussian_ply import read_gaussian_ply
 from edslam_ti.mapping.gaussians import GaussianMap
-from edslam_ti.results.export import read_gaussian_ply
 
 
 def load_map(path: Path) -> GaussianMap:

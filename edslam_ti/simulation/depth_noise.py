@@ -54,11 +54,8 @@ def viewing_cosine(
 
     Tangents are differences to the neighbour that is nearer in depth, so that steps do not tilt surfaces.
     """
-    height, width = camera.shape
-    v, u = np.mgrid[0:height, 0:width]
-    z = depth.astype(np.float64)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(z)], -1)
-    points = rays * z[..., None]  # [H, W, 3]
+    rays = camera.rays()
+    points = rays * depth.astype(np.float64)[..., None]  # [H, W, 3]
     tangents = []
     for axis in (1, 0):
         forward = np.diff(points, axis=axis, append=np.take(points, [-1], axis))

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from edslam_ti.camera import Camera
+from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
-from edslam_ti.output import atomic_folder
+from edslam_ti.output import atomic_folder, write_npy_header
 from edslam_ti.simulation.depth_noise import kinect_depth
 from edslam_ti.simulation.paths import CameraPath
 from edslam_ti.simulation.renderer import Render, Renderer
@@ -29,7 +29,6 @@ from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_truth
 
 MILLISECOND = 1_000_000  # nanoseconds
-HEADER_BYTES = 128  # of the event file
 
 
 @dataclass(frozen=True)
@@ -174,13 +173,10 @@ class _FrameTimes:
         v, u, z = v[z > 0], u[z > 0], z[z > 0]
         if len(z) == 0:
             return 0.0
-        points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
+        points = camera.back_project_pixels(u, v, z)
         T = np.linalg.inv(self._path.pose(end / 1e9)) @ self._path.pose(start / 1e9)
-        moved = points @ T[:3, :3].T + T[:3, 3]
-        ahead = np.maximum(moved[:, 2], 0.05)
-        du = camera.fx * moved[:, 0] / ahead + camera.cx - u
-        dv = camera.fy * moved[:, 1] / ahead + camera.cy - v
-        return float(np.percentile(np.hypot(du, dv), 95))
+        later_u, later_v, _ = camera.project(points @ T[:3, :3].T + T[:3, 3], NEAREST)
+        return float(np.percentile(np.hypot(later_u - u, later_v - v), 95))
 
 
 class EventFileWriter:
@@ -190,7 +186,7 @@ class EventFileWriter:
         self.count = 0
         self._dtype = np.dtype(dtype)
         self._file = path.open("wb")
-        self._file.write(b"\0" * HEADER_BYTES)
+        write_npy_header(self._file, self._dtype, 0, 4)
 
     def append(self, events: EventArrays) -> None:
         """Write events as rows x, y, t (s), polarity."""
@@ -205,10 +201,7 @@ class EventFileWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        text = f"{{'descr': '{self._dtype.str}', 'fortran_order': False, 'shape': ({self.count}, 4), }}"
-        prefix = np.lib.format.magic(1, 0) + (HEADER_BYTES - 10).to_bytes(2, "little")
-        self._file.seek(0)
-        self._file.write(prefix + text.ljust(HEADER_BYTES - 11).encode("latin1") + b"\n")
+        write_npy_header(self._file, self._dtype, self.count, 4)
         self._file.close()
 
 

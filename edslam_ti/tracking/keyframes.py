@@ -1,7 +1,7 @@
 """Keyframes with a log-brightness image, and direct alignment of images and depth to them.
 
 Everything is relative to the keyframe; where keyframes are in the world is the tracker's business
-(brightness_tracking.py).
+(image_tracker.py).
 """
 
 import math
@@ -21,11 +21,8 @@ from edslam_ti.kernels import depth_average
 from edslam_ti.kernels.depth_average import DepthAgreement, PixelRays, average_depth
 from edslam_ti.kernels.patch_warp import NormalEquations, Patches
 
-IMAGE_WIDTH = 192  # pixels, roughly
-COARSE_STEPS = 6  # Levenberg-Marquardt steps a level; twice as many without depth
-SMALL_GAIN = 1e-3  # relative decrease of the cost: near enough for the next, finer level
-STRONG_GRADIENT = 0.02  # log brightness per pixel; such pixels are aligned first
-MAX_MISFIT = 0.25  # log brightness, median: beyond, the image is not that of the keyframe's surfaces
+# Not a setting: the relative decrease of the cost from which on the next, finer level goes on better.
+SMALL_GAIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -37,12 +34,12 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class Moment:
+class BrightnessFrame:
     """What was measured up to one frame, at the size of brightness images."""
 
     index: int  # of the frame in the trajectory
     timestamp: float  # seconds
-    change: np.ndarray  # [h, w] log brightness since the stretch of events began
+    change: np.ndarray  # [h, w] log brightness since the segment of events began
     depth: Depth | None
 
 
@@ -51,7 +48,7 @@ class BrightnessKeyframe:
     """A frame with depth, and the log-brightness image solved for it."""
 
     index: int  # of the frame in the trajectory
-    change: np.ndarray  # [h, w] as in `Moment`
+    change: np.ndarray  # [h, w] as in `BrightnessFrame`
     measured: Depth  # at its time
     depth: Depth  # averaged with that of neighbouring frames
     log_brightness: np.ndarray  # [h, w]
@@ -60,9 +57,9 @@ class BrightnessKeyframe:
     next_solution: int  # index of the frame at which the image is solved for again
     is_new_place: bool = True  # no older keyframe shows much the same
 
-    def image_at(self, moment: Moment) -> np.ndarray:  # [h, w]
-        """Return the log brightness at another time of the same stretch of events."""
-        return self.log_brightness + (moment.change - self.change)
+    def image_at(self, frame: BrightnessFrame) -> np.ndarray:  # [h, w]
+        """Return the log brightness at another frame of the same segment of events."""
+        return self.log_brightness + (frame.change - self.change)
 
     def reduced(self) -> "BrightnessKeyframe":
         """Return what places are recognised by: a twentieth of the memory."""
@@ -84,20 +81,19 @@ class Aligned:
         """Share of the keyframe's pixels in view."""
         return self.system.num_surface / max(self.system.num_usable, 1)
 
-    @property
-    def quality(self) -> float:
-        """From 0 to 1."""
-        return min(1.0, self.overlap) * max(0.0, 1 - self.misfit / MAX_MISFIT)
+    def quality(self, config: TrackingConfig) -> float:
+        """Return how far the pose can be trusted, from 0 to 1."""
+        return min(1.0, self.overlap) * max(0.0, 1 - self.misfit / config.images.max_misfit)
 
-    def problem(self, min_overlap: float) -> str:
+    def problem(self, config: TrackingConfig) -> str:
         """Return why the pose cannot be trusted, or nothing."""
         if self.system.num_surface < MIN_PIXELS:
             return f"only {self.system.num_surface} pixels of the keyframe in view"
-        if self.overlap < min_overlap:
+        if self.overlap < config.min_inliers:
             return f"only {self.overlap:.0%} of the keyframe in view"
         if not is_observed(self.system):
             return "motion not fully observed (ill-conditioned)"
-        if self.misfit > MAX_MISFIT:
+        if self.misfit > config.images.max_misfit:
             return f"brightness differs by {self.misfit:.2f} (median, log)"
         return ""
 
@@ -106,13 +102,13 @@ class KeyframeAligner:
     """Solves for keyframes' images, and aligns other images and depth to them."""
 
     def __init__(self, camera: Camera, config: TrackingConfig, seed: int) -> None:
-        # Images are halved until they are about 192 pixels wide: the noise of events averages out.
-        self._level = max(0, round(math.log2(camera.width / IMAGE_WIDTH)))
+        # Images are halved until they are about that wide: the noise of events averages out.
+        self._level = max(0, round(math.log2(camera.width / config.images.image_width)))
         self._camera = camera
         self._rays = PixelRays(camera.shape, camera.intrinsics)
         self._cameras = [camera.downscaled(2 ** (self._level + k)) for k in range(2)]
         self._random = np.random.default_rng(seed + 1)
-        self._num_pixels = config.num_patches * config.patch_size**2 // 4
+        self._settings = config.images
         self._model = residual_model(config, config.brightness_sigma)
         self._brightness_only = replace(self._model, depth_weight=0.0)
         self._depth_only = replace(self._model, surface_sigma=1e4)  # in effect infinite
@@ -126,12 +122,17 @@ class KeyframeAligner:
 
     # --- a keyframe's image ---
 
-    def moment(self, index: int, frame: Frame, change: np.ndarray) -> Moment:  # [H, W] log brightness
+    def brightness_frame(
+        self,
+        index: int,  # of the frame in the trajectory
+        frame: Frame,
+        change: np.ndarray,  # [H, W] log brightness
+    ) -> BrightnessFrame:
         """Return what was measured up to a frame, at the size of brightness images."""
         for _ in range(self._level):
             change = downscaled(change)
         depth = None if frame.depth is None else self._reduced(frame.depth)
-        return Moment(index, frame.timestamp, change, depth)
+        return BrightnessFrame(index, frame.timestamp, change, depth)
 
     def _reduced(self, depth: np.ndarray) -> Depth:  # [H, W] metres
         small = depth
@@ -142,16 +143,16 @@ class KeyframeAligner:
     def solve(
         self,
         keyframe: BrightnessKeyframe,
-        moments: Sequence[Moment],
-        poses: Sequence[np.ndarray],  # [4, 4] T_camera_keyframe at these moments
+        frames: Sequence[BrightnessFrame],
+        poses: Sequence[np.ndarray],  # [4, 4] T_camera_keyframe at these frames
         iterations: int,
         is_robust: bool,
     ) -> None:
         """Solve for the keyframe's image, average its depth, and choose its pixels to align."""
-        keyframe.depth = self._averaged_depth(keyframe, moments, poses)
+        keyframe.depth = self._averaged_depth(keyframe, frames, poses)
         observations = [
-            Observation(T, m.change - keyframe.change, None if m.depth is None else m.depth.small)
-            for m, T in zip(moments, poses, strict=True)
+            Observation(T, f.change - keyframe.change, None if f.depth is None else f.depth.small)
+            for f, T in zip(frames, poses, strict=True)
         ]
         keyframe.log_brightness = solve_log_brightness_image(
             keyframe.depth.small, self.camera, observations, keyframe.log_brightness,
@@ -161,10 +162,10 @@ class KeyframeAligner:
         keyframe.depth_points = self._rays.points(keyframe.depth.full)
 
     def _averaged_depth(
-        self, keyframe: BrightnessKeyframe, moments: Sequence[Moment], poses: Sequence[np.ndarray]
+        self, keyframe: BrightnessKeyframe, frames: Sequence[BrightnessFrame], poses: Sequence[np.ndarray]
     ) -> Depth:
-        """Return the keyframe's depth averaged with that of other moments where they agree."""
-        with_depth = [(m.depth.full, T) for m, T in zip(moments, poses) if m.depth is not None]
+        """Return the keyframe's depth averaged with that of other frames where they agree."""
+        with_depth = [(f.depth.full, T) for f, T in zip(frames, poses) if f.depth is not None]
         average = average_depth(
             keyframe.measured.full,
             [depth for depth, _ in with_depth],
@@ -188,8 +189,8 @@ class KeyframeAligner:
         down, right = np.gradient(image)
         v, u = np.nonzero(depth)
         order = self._random.permutation(len(v))
-        is_strong = np.hypot(down, right)[v, u][order] > STRONG_GRADIENT
-        order = np.concatenate([order[is_strong], order[~is_strong]])[: self._num_pixels >> level]
+        is_strong = np.hypot(down, right)[v, u][order] > self._settings.strong_gradient
+        order = np.concatenate([order[is_strong], order[~is_strong]])[: self._settings.num_pixels >> level]
         v, u = v[order], u[order]
         pixels = np.stack([u, v, 1 / depth[v, u]], -1).astype(np.float32)
         return Patches(pixels, image[v, u]).points(self._cameras[level].intrinsics)
@@ -205,7 +206,7 @@ class KeyframeAligner:
     ) -> Aligned:
         """Align an image, and its depth where there is any, to a keyframe, coarse to fine."""
         small = np.zeros_like(image) if depth is None else depth.small
-        steps = COARSE_STEPS if depth is not None else 2 * COARSE_STEPS
+        steps = self._settings.steps if depth is not None else 2 * self._settings.steps
         T = start
         for level, view in ((1, [downscaled(image), downscaled_depth(small)]), (0, [image, small])):
             linearise = linearised(keyframe.points[level], self._model, view, self._cameras[level])
@@ -232,7 +233,7 @@ class KeyframeAligner:
         for level, image in ((1, downscaled_depth(depth.small)), (0, depth.small)):
             view = [np.zeros_like(image), image]
             linearise = linearised(keyframe.points[level], self._depth_only, view, self._cameras[level])
-            T, system = levenberg_marquardt(linearise, T, COARSE_STEPS)
+            T, system = levenberg_marquardt(linearise, T, self._settings.steps)
         return orthonormalized(T), system
 
     # --- what is in view ---

@@ -10,7 +10,7 @@ from edslam_ti.tracking.keyframes import BrightnessKeyframe
 MIN_MATCHES = 15  # features that must agree for a keyframe to be recognised
 
 
-def recognised(
+def pose_by_features(
     old: BrightnessKeyframe, new: BrightnessKeyframe, camera: Camera
 ) -> np.ndarray | None:  # [4, 4]
     """Return T_old_new by features that both keyframes' images show, or None. `camera`: of these images."""

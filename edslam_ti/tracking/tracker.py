@@ -1,7 +1,7 @@
 """What a tracker is, what it returns, and the tracker that knows the true poses."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +18,9 @@ class TrackingResult:
     converged: bool
     quality: float  # fraction of patch pixels in agreement, 0 to 1
     message: str = ""  # why it failed, or what else is worth the log
+    corrections: Mapping[int, np.ndarray] = field(
+        default_factory=dict
+    )  # better poses [4, 4] of earlier frames
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,10 @@ class Tracker(Protocol):
     """Finds the pose of a frame; the first frame gets the pose it is expected at."""
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`, expected near `guess` [4, 4]; `trajectory` holds those before it."""
+        """Return the pose of `frame`, expected near `guess` [4, 4]; `trajectory` holds those before it.
+
+        What the frame says of earlier poses comes back as corrections: the trajectory is not changed here.
+        """
 
 
 class TruePoses:

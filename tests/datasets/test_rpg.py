@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -93,6 +94,8 @@ def test_text_is_parsed_once_and_again_when_it_changes(folder: Path, cache: Path
         ("events.txt", "\n\n", r"events\.txt: expected lines 't x y p', got an empty file"),
         ("events.txt", "0.1 1 1\n", r"events\.txt: expected 4 numbers a line"),
         ("events.txt", "0.1 1 1 1\n0.2 1 one 1\n", r"events\.txt: expected lines .* behind row 0: .*one"),
+        ("events.txt", "0.1 1 1 1\n0.2 1", r"events\.txt: expected lines .* from 4 to 2 at row 2"),
+        ("events.txt", "t x y p\n0.1 1 1 1\n", r"events\.txt: expected lines .* behind row 0: .*'t'"),
         ("events.txt", "0.1 1 1 1\n0.2 40 1 1\n", r"events\.txt: row 2: expected x in 0 to 39"),
         ("calib.txt", "1 2 3\n", r"calib\.txt: expected 9 numbers a line .* got 3"),
         ("calib.txt", "no calibration\n", r"calib\.txt: expected 9 numbers"),
@@ -114,6 +117,15 @@ def test_bad_data_is_refused_in_one_line(
         RpgSequence(folder)
     assert "\n" not in str(caught.value)
     assert not [p for p in cache.glob("events/*") if ".partial" in p.name]
+
+
+def test_a_long_text_is_announced_in_the_log_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capfd: Any
+) -> None:
+    monkeypatch.setattr("edslam_ti.datasets.rpg.SLOW_TO_PARSE", 100)
+    open_text_events(folder / "events.txt", WIDTH, HEIGHT)
+    assert f"reading {folder / 'events.txt'} once" in caplog.text
+    assert "reading" not in capfd.readouterr().out
 
 
 def test_depth_poses_and_camera_of_slider_depth_agree(shared_data: Path, tmp_path: Path) -> None:

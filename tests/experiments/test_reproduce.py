@@ -28,7 +28,7 @@ from edslam_ti.experiments.ablations import (
     ablation_variants,
 )
 from edslam_ti.experiments.cases import Case, Recording, all_cases, quick_cases
-from edslam_ti.experiments.long_stream import FrameCost, held_bytes, measure, stretches, table
+from edslam_ti.experiments.long_stream import FrameCost, held_bytes, measure, table, windows
 from edslam_ti.experiments.recordings import Recordings
 from edslam_ti.experiments.report import insert_into, markdown, write_report
 from edslam_ti.experiments.runs import Variant, methods_as_variants, result_file, run_all
@@ -116,7 +116,7 @@ def test_growth_is_counted_from_the_warm_up_on() -> None:
         FrameCost(t, 0.2 if t < 15 else 0.3, 0.1, 0.1, 500 + t, int(1000 * t), 0.2 * t, 7.0, 0.1 * t)
         for t in range(20)
     ]
-    text = table(stretches(costs, length=5.0))
+    text = table(windows(costs, length=5.0))
     parts = "map +2.0, frames +0.0, tracker +1.0, other +7.0"
     assert f"Since 10 s: +10 MB with +10000 Gaussians ({parts}), CPU time a frame +50 %." in text
 

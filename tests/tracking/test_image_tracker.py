@@ -9,7 +9,9 @@ from sequences import (
     position_errors,
     record_tiny_room,
     settings,
+    there_and_back,
     tracked,
+    with_depth_scaled,
     without_depth,
     without_events,
 )
@@ -19,7 +21,6 @@ from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.event_images.solve import HYSTERESIS, BrightnessChange
 from edslam_ti.events import Events
 from edslam_ti.slam import Slam
-from edslam_ti.tracking import image_tracker
 
 GAP = range(16, 22)  # frames, a quarter of a second
 
@@ -86,10 +87,64 @@ def test_depth_carries_over_a_gap_in_the_events_and_a_new_image_follows(
     gappy = [without_events(s) if k in GAP else s for k, s in enumerate(samples)]
     slam = tracked(sequence, gappy)
     assert "events are missing" in slam.results[GAP.start].message
-    after = " / ".join(result.message for result in slam.results[GAP.stop :])
-    assert "relocalised by the place of frame" in after or "no place recognised" in after
+    # So small an image of so near a wall fits its neighbour a little worse than the default asks for.
+    assert "no place recognised" in messages(slam)
     assert lost(slam) == []
     assert ate_cm(slam, sequence) < 0.5
+
+
+def errors_cm(slam: Slam, samples: list[Sample]) -> np.ndarray:  # [F]
+    """Return the distance of every position from that of the samples."""
+    truth = np.array([s.T_world_camera for s in samples])
+    return 100 * np.linalg.norm(slam.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+
+
+def test_after_a_blackout_an_old_keyframe_says_where_the_camera_is(
+    sequence: EventDepthSequence, samples: list[Sample]
+) -> None:
+    # Neither events nor depth while the camera turns back: constant velocity leads 20 cm astray.
+    blackout = range(26, 34)
+    path = there_and_back(samples)[:48]
+    blind = [without_depth(without_events(s)) if k in blackout else s for k, s in enumerate(path)]
+    runs = {
+        misfit: tracked(sequence, blind, settings(tracking={"images": {"revisit_misfit": misfit}}))
+        for misfit in (0.2, 1e-6)
+    }
+    found, not_found = runs.values()
+    assert lost(found) == list(blackout)
+    assert "relocalised by the place of frame" in found.results[37].message
+    assert "no place recognised" in not_found.results[37].message
+    assert errors_cm(not_found, path)[34:].min() > 15
+    assert errors_cm(found, path)[34:].max() < 0.6  # 0.2 to 0.35 cm was measured
+    # The poses inside the gap are corrected from both of its ends.
+    assert errors_cm(found, path)[list(blackout)].max() < 0.2 * errors_cm(not_found, path)[33]
+
+
+def test_drift_is_taken_back_where_a_place_is_seen_again(
+    sequence: EventDepthSequence, samples: list[Sample]
+) -> None:
+    # Depth that becomes 2 % too long on the way there, and soon right again on the way back: a path of
+    # another length, which does not end where it began.
+    path, n = there_and_back(samples), len(samples)
+    factors = [1 + 0.02 * k / (n - 1) for k in range(n)]
+    factors += [1 + 0.02 * max(0.0, 1 - (k + 1) / 8) for k in range(n - 1)]
+    drifting = [with_depth_scaled(s, factor) for s, factor in zip(path, factors)]
+    closed = tracked(sequence, drifting)
+    never = settings(tracking={"images": {"revisit_overlap": 0.99}})
+    open_ended = tracked(sequence, drifting, never)
+    assert "seen again" in messages(closed)
+    assert "seen again" not in messages(open_ended)
+    apart = [
+        np.linalg.norm(s.trajectory.pose(-1)[:3, 3] - s.trajectory.pose(0)[:3, 3])
+        for s in (closed, open_ended)
+    ]
+    assert apart[0] < 0.6 * apart[1]  # 1.1 and 2.2 cm were measured
+    # The correction reaches frames between the keyframes, and earlier ones, too.
+    moved = np.linalg.norm(closed.trajectory.poses[:, :3, 3] - open_ended.trajectory.poses[:, :3, 3], axis=1)
+    assert (moved[24 : 2 * n - 1] > 1e-4).all()
+    # What the tracker said at the time stays known.
+    as_tracked = closed.frontend_trajectory.poses[:, :3, 3]
+    assert np.linalg.norm(as_tracked - closed.trajectory.poses[:, :3, 3], axis=1).max() > 1e-3
 
 
 def test_events_carry_over_a_gap_in_the_depth(sequence: EventDepthSequence, samples: list[Sample]) -> None:
@@ -98,14 +153,16 @@ def test_events_carry_over_a_gap_in_the_depth(sequence: EventDepthSequence, samp
     assert ate_cm(slam, sequence) < 0.5
 
 
-def test_a_camera_that_stops_keeps_its_image(
-    sequence: EventDepthSequence, samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("is_fast", [False, True])
+def test_a_slow_camera_that_stops_keeps_its_image(
+    sequence: EventDepthSequence, samples: list[Sample], is_fast: bool
 ) -> None:
-    monkeypatch.setattr(image_tracker, "SILENT_FLOW", np.inf)  # as if it had been slow before
     last = samples[11]
     pause = [replace(without_events(last), timestamp=last.timestamp + 0.05 * k) for k in range(1, 5)]
-    slam = tracked(sequence, [*samples[:12], *pause])
-    assert "events are missing" not in messages(slam)
+    # A camera with more flow than this does not stop within one frame: events must be missing.
+    stops = settings(tracking={"images": {"silent_flow": 0.0 if is_fast else 1e6}})
+    slam = tracked(sequence, [*samples[:12], *pause], stops)
+    assert ("events are missing" in messages(slam)) == is_fast
     moved = slam.trajectory.poses[12:, :3, 3] - slam.trajectory.pose(11)[:3, 3]
     assert np.linalg.norm(moved, axis=1).max() < 0.002
 

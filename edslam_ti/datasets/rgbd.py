@@ -1,0 +1,372 @@
+"""Recordings of depth cameras without events, in three published layouts.
+
+TUM RGB-D (Sturm et al. 2012):
+
+    depth.txt, rgb.txt     t [s] path, '#' comments
+    groundtruth.txt        t [s] tx ty tz qx qy qz qw       optional; T_world_camera
+    depth/*.png            16 bits, 1/5000 m, registered to the colour image
+
+Replica as NICE-SLAM rendered it (Zhu et al. 2022):
+
+    results/depthNNNNNN.png, results/frameNNNNNN.jpg        numbered from 0
+    traj.txt               16 numbers a line, T_world_camera of frame 0, 1, ...
+    ../cam_params.json     {"camera": {w, h, fx, fy, cx, cy, scale}}; may also lie in the folder itself
+
+7-Scenes (Shotton et al. 2013) and 3DMatch (Zeng et al. 2017), one folder a sequence:
+
+    [frames/]frame-NNNNNN.depth.png, .color.{png,jpg}, .pose.txt      16 bits, 1/1000 m; T_world_camera
+    camera-intrinsics.txt  3x3 matrix K; may also lie in the folder above
+
+Poses and images are optional, depth is not. Depth of 65535 is "no measurement" in 7-Scenes and the end of
+the scale elsewhere: missing. A `camera.json` as in event_replica.py may state the camera (all of width,
+height, fx, fy, cx, cy; pixel centres at integers unless it says "half"), `depth_scale` and `frame_rate`
+(default 30 Hz, where files have numbers and no times).
+
+TUM states no camera in its folders: `freiburg1`, 2 or 3 in the folder's name gives the published one, and
+images and depth are undistorted with it. Its depth and colour are not taken at the same moment: each depth
+image gets the nearest colour image within `MAX_DIFFERENCE`, each colour image serves once, and counts as
+taken at the time of the depth.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.datasets.event_replica import LATEST_START, CameraFile, check_rigid, read_camera
+from edslam_ti.datasets.files import (
+    image_size,
+    numbered_files,
+    read_depth,
+    read_image,
+    read_numbers,
+    read_timed_paths,
+)
+from edslam_ti.errors import DataError
+from edslam_ti.events import Events
+from edslam_ti.geometry import orthonormalized
+from edslam_ti.trajectory import Trajectory, read_tum
+
+MAX_DIFFERENCE = 0.02  # s between depth and its colour image (associate.py of the TUM benchmark)
+NO_MEASUREMENT = 65535  # PNG value
+TUM_SCALE, MILLIMETRES = 5000.0, 1000.0  # PNG units in a metre
+INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
+# Of the TUM benchmark's page: fx, fy, cx, cy of 640x480 pixels, then distortion k1, k2, p1, p2, k3.
+FREIBURG = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), (0.0, 0.0, 0.0, 0.0, 0.0)),
+}
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """What a layout's files say."""
+
+    camera: Camera
+    metres_per_unit: float
+    depth_files: list[Path]
+    depth_times: np.ndarray  # [D] s, strictly increasing
+    image_files: list[Path]
+    image_times: np.ndarray  # [I] s, strictly increasing
+    truth: Trajectory | None
+    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 of images and depth; none: undistorted
+
+
+class RgbdSequence(EventDepthSequence):
+    """A folder in one of the layouts; it has no events."""
+
+    dataset = "rgbd"
+    contrast_threshold = None
+    has_events = False
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: sequence folder not found")
+        self.scene = folder.name
+        layout = next((name for name, layout in LAYOUTS.items() if layout.detect(folder)), None)
+        if layout is None:
+            expected = " or ".join(f"{layout.files} ({name})" for name, layout in LAYOUTS.items())
+            raise DataError(f"{folder}: no depth found; expected {expected}")
+        recording = LAYOUTS[layout].read(folder)
+        self.camera, self.description = recording.camera, f"{layout} layout, {folder}, no events"
+        self._depth_files, self._image_files = recording.depth_files, recording.image_files
+        self._metres_per_unit = recording.metres_per_unit
+        first = float(recording.depth_times[0])
+        self.time_offset = first if abs(first) > LATEST_START else 0.0
+        self.depth_timestamps = recording.depth_times - self.time_offset
+        self.image_timestamps = recording.image_times - self.time_offset
+        self.truth = None
+        if recording.truth is not None:
+            self.truth = Trajectory(recording.truth.timestamps - self.time_offset, recording.truth.poses)
+        self._maps = _undistortion(self.camera, recording.distortion)
+        self.depth(0)  # a wrong size or format shows now, not in the middle of a run
+        if self._image_files:
+            self.image(0)
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        return float(self.depth_timestamps[0]), float(self.depth_timestamps[-1])
+
+    def events(self, start: float, end: float) -> Events:
+        return Events.empty()
+
+    def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+        depth = read_depth(self._depth_files[index], self.camera, self._metres_per_unit)
+        depth[depth == np.float32(NO_MEASUREMENT) * np.float32(self._metres_per_unit)] = 0
+        if self._maps is None:
+            return depth
+        return np.asarray(cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST))
+
+    def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
+        image = read_image(self._image_files[index], self.camera)
+        if self._maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR))
+
+
+def is_rgbd(folder: Path) -> bool:
+    """Return whether a folder holds depth images where one of the layouts has them."""
+    return any(layout.detect(folder) for layout in LAYOUTS.values())
+
+
+def _undistortion(camera: Camera, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray] | None:
+    if not any(distortion):
+        return None
+    K, size = camera.matrix, (camera.width, camera.height)
+    u, v = cv2.initUndistortRectifyMap(K, np.array(distortion), np.eye(3), K, size, cv2.CV_32FC1)
+    return u, v
+
+
+# --- TUM RGB-D ---
+
+
+def _is_tum(folder: Path) -> bool:
+    return (folder / "depth.txt").is_file() and (folder / "rgb.txt").is_file()
+
+
+def _read_tum(folder: Path) -> _Recording:
+    depth_times, depth_files = read_timed_paths(folder / "depth.txt")
+    image_times, image_files = read_timed_paths(folder / "rgb.txt")
+    partners = associated(depth_times, image_times, MAX_DIFFERENCE)
+    if not partners:
+        raise DataError(
+            f"{folder}: expected colour within {MAX_DIFFERENCE} s of depth, got none; rgb.txt covers "
+            f"{image_times[0]:.3f} to {image_times[-1]:.3f} s, depth.txt {depth_times[0]:.3f} to "
+            f"{depth_times[-1]:.3f} s"
+        )
+    stated = read_camera(folder / "camera.json")
+    camera = _stated_camera(folder, stated)
+    distortion: tuple[float, ...] = ()
+    if camera is None:
+        camera, distortion = _freiburg_camera(folder)
+    has_truth = (folder / "groundtruth.txt").is_file()
+    return _Recording(
+        camera,
+        _metres_per_unit(stated, TUM_SCALE),
+        depth_files,
+        depth_times,
+        [image_files[k] for k in partners.values()],
+        depth_times[list(partners)],
+        read_tum(folder / "groundtruth.txt") if has_truth else None,
+        distortion,
+    )
+
+
+def associated(
+    first: np.ndarray,  # [A] s, increasing
+    second: np.ndarray,  # [B] s, increasing
+    max_difference: float,  # s
+) -> dict[int, int]:
+    """Return the partner in `second` of each time in `first` that has one, nearest pairs first.
+
+    No time is used twice (associate.py of the TUM benchmark).
+    """
+    low, high = (np.searchsorted(second, first + d) for d in (-max_difference, max_difference))
+    pairs = [(abs(first[i] - second[j]), i, j) for i in range(len(first)) for j in range(low[i], high[i])]
+    partners: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in sorted(pairs):
+        if i not in partners and j not in taken:
+            partners[i] = j
+            taken.add(j)
+    return dict(sorted(partners.items()))
+
+
+def _freiburg_camera(folder: Path) -> tuple[Camera, tuple[float, ...]]:
+    """Return the published camera of a TUM sequence, known by its name, and its distortion."""
+    name = re.search(r"f(?:reiburg|r)([123])(?!\d)", folder.resolve().name)
+    if name is None:
+        raise DataError(
+            f"{folder}: TUM RGB-D folders do not state their camera; expected freiburg1, 2 or 3 in the "
+            f"folder's name, or camera.json with {', '.join(INTRINSICS)}"
+        )
+    intrinsics, distortion = FREIBURG[name[1]]
+    return Camera(640, 480, *intrinsics), distortion
+
+
+# --- Replica as NICE-SLAM rendered it ---
+
+
+def _is_replica(folder: Path) -> bool:
+    return any((folder / "results").glob("depth*.png"))
+
+
+def _read_replica(folder: Path) -> _Recording:
+    results = folder / "results"
+    stated = read_camera(folder / "camera.json")
+    camera, metres_per_unit = _stated_camera(folder, stated), stated.metres_per_unit
+    if camera is None or "depth_scale" not in stated.model_fields_set:
+        published, units_per_metre = _replica_camera(folder)
+        camera, metres_per_unit = camera or published, _metres_per_unit(stated, units_per_metre)
+    depth = numbered_files(results, "depth*", (".png",))
+    images = _numbered(results, "frame*", (".jpg", ".jpeg", ".png"))
+    truth = None
+    if (folder / "traj.txt").is_file():
+        poses = _poses(folder / "traj.txt")
+        if max(depth) >= len(poses):
+            raise DataError(
+                f"{folder / 'traj.txt'}: expected a pose for every frame, line 1 for frame 0, got "
+                f"{len(poses)} lines and {depth[max(depth)].name}"
+            )
+        truth = Trajectory(np.arange(len(poses)) / stated.frame_rate, poses)
+    return _Recording(
+        camera,
+        metres_per_unit,
+        *_with_times(depth, stated),
+        *_with_times(images, stated),
+        truth,
+    )
+
+
+def _replica_camera(folder: Path) -> tuple[Camera, float]:
+    """Return the camera of cam_params.json and the depth PNG units in a metre."""
+    places = [parent / "cam_params.json" for parent in (folder, folder.resolve().parent)]
+    path = next((p for p in places if p.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"{places[1]} not found; expected NICE-SLAM's cam_params.json there or in the sequence's folder"
+        )
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["camera"]
+        w, h, fx, fy, cx, cy, scale = (float(values[k]) for k in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f'{path}: expected {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}; {type(error).__name__}: {error}'
+        ) from error
+    if not scale > 0:
+        raise DataError(f"{path}: scale: expected depth units in a metre, got {scale}")
+    return Camera(round(w), round(h), fx, fy, cx, cy), scale
+
+
+# --- 7-Scenes and 3DMatch ---
+
+
+def _frames_folder(folder: Path) -> Path:
+    return folder / "frames" if (folder / "frames").is_dir() else folder
+
+
+def _is_frames(folder: Path) -> bool:
+    return any(_frames_folder(folder).glob("*.depth.png"))
+
+
+def _read_frames(folder: Path) -> _Recording:
+    frames = _frames_folder(folder)
+    stated = read_camera(folder / "camera.json")
+    depth = numbered_files(frames, "*.depth*", (".png",))
+    images = _numbered(frames, "*.color*", (".png", ".jpg", ".jpeg"))
+    camera = _stated_camera(folder, stated) or _matrix_camera(folder, next(iter(depth.values())))
+    truth = None
+    pose_files = numbered_files(frames, "*.pose*", (".txt",))
+    if pose_files:
+        poses = np.concatenate([_poses(path) for path in pose_files.values()])
+        truth = Trajectory(np.array(list(pose_files)) / stated.frame_rate, poses)
+    return _Recording(
+        camera,
+        _metres_per_unit(stated, MILLIMETRES),
+        *_with_times(depth, stated),
+        *_with_times(images, stated),
+        truth,
+    )
+
+
+def _matrix_camera(folder: Path, image: Path) -> Camera:
+    """Return the camera of camera-intrinsics.txt, of the size of an image."""
+    places = [parent / "camera-intrinsics.txt" for parent in (folder, folder.resolve().parent)]
+    path = next((p for p in places if p.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"{places[0]} not found; expected the 3x3 matrix K (7-Scenes states 585 0 320, 0 585 240, "
+            f"0 0 1), or camera.json with {', '.join(INTRINSICS)}"
+        )
+    K = read_numbers(path, 3, "a row of the 3x3 matrix K")
+    zeros = () if K.shape != (3, 3) else (K[0, 1], K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1)
+    if K.shape != (3, 3) or any(zeros):
+        raise DataError(
+            f"{path}: expected fx 0 cx, 0 fy cy, 0 0 1, got "
+            f"{np.array2string(K.ravel(), max_line_width=10**6)}"
+        )
+    return Camera(*image_size(image), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+
+
+# --- all layouts ---
+
+
+def _stated_camera(folder: Path, stated: CameraFile) -> Camera | None:
+    """Return the camera that camera.json states, None where it says nothing of it."""
+    missing = [name for name in INTRINSICS if name not in stated.model_fields_set]
+    if len(missing) == len(INTRINSICS):
+        return None
+    if missing:
+        raise DataError(f"{folder / 'camera.json'}: expected all of {', '.join(INTRINSICS)}, or none of them")
+    if "pixel_centres" in stated.model_fields_set:
+        return stated.camera
+    return Camera(*(getattr(stated, name) for name in INTRINSICS))
+
+
+def _metres_per_unit(stated: CameraFile, units_per_metre: float) -> float:
+    is_stated = "depth_scale" in stated.model_fields_set
+    return stated.metres_per_unit if is_stated else 1 / units_per_metre
+
+
+def _numbered(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Return the files of a pattern by their number; there need not be any."""
+    return numbered_files(folder, pattern, suffixes) if any(folder.glob(pattern)) else {}
+
+
+def _with_times(files: dict[int, Path], stated: CameraFile) -> tuple[list[Path], np.ndarray]:
+    """Return the files and their times (s), from the numbers in their names."""
+    return list(files.values()), np.array(list(files)) / stated.frame_rate
+
+
+def _poses(path: Path) -> np.ndarray:  # [F, 4, 4]
+    """Return the poses of a file: 16 numbers a line, or one matrix in 4 lines of 4."""
+    columns = 16 if path.name == "traj.txt" else 4
+    rows = read_numbers(path, columns, "the 4x4 matrix T_world_camera, row by row")
+    if rows.size % 16:
+        raise DataError(f"{path}: expected a 4x4 matrix T_world_camera, got {len(rows)} rows of {columns}")
+    poses = rows.reshape(-1, 4, 4)
+    check_rigid(poses, path)
+    return np.array([orthonormalized(T) for T in poses])
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How depth images and what belongs to them are arranged in a folder."""
+
+    files: str  # what tells it, for messages
+    detect: Callable[[Path], bool]
+    read: Callable[[Path], _Recording]
+
+
+LAYOUTS = {
+    "TUM RGB-D": _Layout("depth.txt and rgb.txt", _is_tum, _read_tum),
+    "NICE-SLAM Replica": _Layout("results/depthNNNNNN.png", _is_replica, _read_replica),
+    "7-Scenes": _Layout("frame-NNNNNN.depth.png", _is_frames, _read_frames),
+}
