@@ -19,6 +19,7 @@ from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping.mapper import Mapper
+from edslam_ti.memory import release_free_memory
 from edslam_ti.methods import METHODS
 from edslam_ti.results.folder import save
 from edslam_ti.results.run import Run
@@ -34,6 +35,7 @@ def run(config: Config, console: Console | None = None) -> Path:
 
     Ctrl-C ends the loop early; what there is, is saved, then KeyboardInterrupt is raised.
     """
+    config.require_device()
     console = console or Console()
     try:
         kernels.init(config.device, threads=config.threads)
@@ -170,6 +172,8 @@ def _process(state: Run, interrupt: _Interrupt, viewer: Viewer, console: Console
             if interrupt.requested:
                 break
             result = slam.process(sample, is_held_out=k in state.held_out)
+            if mapper is not None:
+                release_free_memory()  # arrays of ever other sizes come and go while mapping
             state.num_events += len(sample.events)
             if not result.converged:
                 state.note(f"frame {k} at {sample.timestamp:.3f} s lost: {result.message}")

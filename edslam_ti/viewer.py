@@ -108,7 +108,7 @@ def check_display() -> None:
     ):
         raise EdSlamError(
             "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); run without "
-            "--visualize, and draw finished runs with: python apps/view.py RESULT --save FILE.png"
+            "--visualize, and draw finished runs with: edslam view RESULT --save FILE.png"
         )
 
 

@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[1]
 # Ranks from the bottom to the top. A name is a module of edslam_ti or a folder of it. Modules of one rank do
 # not import each other, but for those in the order of ORDERS.
 RANKS: list[list[str]] = [
-    ["kernels", "errors", "memory", "output", "open3d_loader"],
-    ["config", "geometry", "camera", "events"],
+    ["kernels", "errors", "memory", "output", "open3d_loader", "cold_start"],
+    ["config", "arguments", "geometry", "camera", "events"],
     ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
@@ -21,6 +21,7 @@ RANKS: list[list[str]] = [
     ["methods", "results"],
     ["pipeline", "command_line"],
     ["experiments"],
+    ["commands"],
     ["apps"],
 ]
 
@@ -28,8 +29,8 @@ RANKS: list[list[str]] = [
 # that are not listed may import freely inside, without a cycle.
 ORDERS: dict[str, list[str]] = {
     "ranks": [
-        *("errors", "memory", "output", "open3d_loader", "kernels"),
-        *("config", "geometry", "camera", "events"),
+        *("errors", "memory", "output", "open3d_loader", "kernels", "cold_start"),
+        *("config", "arguments", "geometry", "camera", "events"),
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
@@ -44,11 +45,11 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": ["trajectories", "lpips", "images", "meshes"],
     "results": [
-        *("run", "reading", "export", "pictures", "plots", "window", "views", "metrics", "folder"),
+        *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
     ],
     "experiments": [
-        *("cases", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times", "steps"),
-        "command",
+        *("cases", "selection", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times"),
+        *("steps", "command"),
     ],
 }
 
@@ -57,7 +58,7 @@ LIBRARIES: dict[str, list[str]] = {
     "taichi": ["kernels", "experiments.kernel_times"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
-    "pydantic": ["config", "command_line", "simulation", "datasets"],
+    "pydantic": ["config", "arguments", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
     "scipy": ["trajectory", "simulation", "mapping", "results"],
     "cv2": [
@@ -73,9 +74,8 @@ LIBRARIES: dict[str, list[str]] = {
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
     "matplotlib": ["results", "experiments.steps"],
-    "rich": ["datasets", "results", "pipeline", "experiments", "apps"],
+    "rich": ["datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
-    "tyro": ["command_line", "experiments", "apps"],
 }
 USES_OPEN3D = [
     *(
@@ -91,7 +91,7 @@ USES_OPEN3D = [
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
 HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
-APP_LINES = 100  # a longer app is not thin any more
+APP_LINES = 20  # a longer app is not thin any more
 
 
 def source_files() -> dict[str, Path]:

@@ -295,6 +295,17 @@ def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None
     assert metrics["num_gaussians"] == 0
 
 
+@pytest.mark.parametrize(("is_mapping", "expected"), [(True, 6), (False, 0)])
+def test_free_memory_is_given_back_after_every_mapped_frame(
+    is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(pipeline, "release_free_memory", lambda: calls.append(1))
+    config = config_for(tiny_folder, tmp_path, duration=0.3, mapping={"enabled": is_mapping})
+    assert metrics_of(quiet_run(config))["num_frames"] == 6
+    assert len(calls) == expected
+
+
 def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "open3d_rgbd"))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply"}  # it has no Gaussians

@@ -1,6 +1,6 @@
 """KISS-ICP on the points of the depth images, where the package `kiss-icp` is installed.
 
-Vizzo et al. 2023, the authors' own code (pip install kiss-icp). It is made for lidars; the settings here
+Vizzo et al. 2023, the authors' own code (the extra `kiss`). It is made for lidars; the settings here
 are scaled to rooms. It sees depth images only, so the poses of frames without depth are predicted.
 """
 
@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.errors import MissingExtraError
 from edslam_ti.frame import Frame
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
 
 MAX_RANGE, MIN_RANGE = 10.0, 0.1  # metres
 VOXEL_SIZE = 0.03  # metres, of its local map
-INITIAL_THRESHOLD = 0.1  # metres, first search radius for correspondences
-MIN_MOTION = 0.002  # metres, smallest motion that changes the adaptive threshold
+INITIAL_THRESHOLD = 0.1  # metres within which partners are sought at first
+MIN_MOTION = 0.002  # metres from which motion counts for the adaptive threshold
 
 
 class KissIcpTracker:
@@ -27,22 +28,24 @@ class KissIcpTracker:
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("not installed: method kiss_icp needs pip install kiss-icp") from error
+            message = "not installed: method kiss_icp needs pip install 'edslam-ti[kiss]'"
+            raise MissingExtraError(message) from error
         config = KISSConfig()
         config.data.max_range, config.data.min_range, config.data.deskew = MAX_RANGE, MIN_RANGE, False
         config.mapping.voxel_size = VOXEL_SIZE
         config.adaptive_threshold.initial_threshold = INITIAL_THRESHOLD
         config.adaptive_threshold.min_motion_th = MIN_MOTION
         self._odometry: Any = KissICP(config)
-        self._camera = camera
+        self._rays = camera.rays().reshape(-1, 3)
         self._T_world_start: np.ndarray | None = None
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; without depth, the guess, marked as lost."""
+        """Return the pose of `frame`; without depth it is the guess, and said to be lost."""
         if frame.depth is None:
             message = "no depth image at this time: pose predicted"
             return TrackingResult(T_world_camera_guess, False, 0.0, message)
-        points = self._camera.back_project(frame.depth)
+        depth = frame.depth.reshape(-1, 1)
+        points = (self._rays * depth)[depth[:, 0] > 0].astype(np.float64)
         self._odometry.register_frame(points, np.zeros(len(points)))
         if self._T_world_start is None:
             self._T_world_start = T_world_camera_guess

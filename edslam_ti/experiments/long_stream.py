@@ -14,6 +14,7 @@ from torch import Tensor
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
+from edslam_ti.memory import release_free_memory
 from edslam_ti.output import atomic_file
 from edslam_ti.pipeline import contrast_of, held_out_frames, make_slam
 from edslam_ti.results.pictures import new_figure, save_figure
@@ -46,6 +47,8 @@ def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameC
     for k, sample in enumerate(samples):
         tracking, mapping, cpu = slam.tracking_seconds, slam.mapping_seconds, time.process_time()
         slam.process(sample, is_held_out=k in held_out)
+        if slam.mapper is not None:
+            release_free_memory()  # as the pipeline does
         yield FrameCost(
             sample.timestamp - start,
             time.process_time() - cpu,

@@ -40,7 +40,7 @@ def load_result(folder: Path) -> Result:
     trajectory_path = folder / "trajectory_tum.txt"
     if not trajectory_path.is_file():
         raise DataError(
-            f"{folder}: not a results folder (no trajectory_tum.txt); give one that apps/slam.py made"
+            f"{folder}: not a results folder (no trajectory_tum.txt); give one that `edslam slam` made"
         )
     truth_path, metrics_path = folder / "truth_tum.txt", folder / "metrics.json"
     try:
