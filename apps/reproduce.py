@@ -9,6 +9,7 @@ kept too, so a run that was stopped goes on where it ended. Tables and pictures 
     python apps/reproduce.py tracking --methods ed_slam open3d_icp
     python apps/reproduce.py ablations                                    one setting changed at a time
     python apps/reproduce.py long_stream                                  time and memory along 60 s
+    python apps/reproduce.py report                                       the tables of README and docs
 """
 
 import sys

@@ -45,7 +45,17 @@ ORDERS: dict[str, list[str]] = {
     "evaluation": ["images", "meshes"],
     "results": ["pictures", "export", "plots", "folder"],
     "experiments": [
-        *("cases", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times", "steps"),
+        *(
+            "cases",
+            "recordings",
+            "runs",
+            "ablations",
+            "report",
+            "documents",
+            "long_stream",
+            "kernel_times",
+            "steps",
+        ),
         "command",
     ],
 }
