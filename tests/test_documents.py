@@ -14,14 +14,32 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 import yaml
-from sequences import make_slam, settings
+from edslam_ti.viewer import VIEWERS
+from rich.console import Console
+from sequences import make_slam, settings, tracked
 
-from edslam_ti.datasets import EventDepthSequence, Sample
+from edslam_ti.config import Config, MappingConfig
+from edslam_ti.datasets import FORMATS, EventDepthSequence, Sample, SampledSequence, open_sequence
 from edslam_ti.errors import DataError
-from edslam_ti.experiments.command import report
-from edslam_ti.experiments.documents import cell, documents_in, read_table, table_names, write_tables
+from edslam_ti.event_images.contrast import ContrastThreshold
+from edslam_ti.experiments.documents import (
+    cell,
+    documents_in,
+    read_table,
+    report_tables,
+    table_names,
+    write_tables,
+)
+from edslam_ti.frame import FrameBuilder
+from edslam_ti.mapping.gaussians import GaussianMap
+from edslam_ti.mapping.mapper import Mapper
+from edslam_ti.methods import METHODS
+from edslam_ti.pipeline import run
+from edslam_ti.slam import Slam
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -237,11 +255,132 @@ def test_commands_parse(document: Path) -> None:
                 )
 
 
+# --- recipes ---
+
+RECIPES = ROOT / "docs/extending.md"
+
+
+@pytest.fixture
+def registries() -> Iterator[None]:
+    """Put back what the recipes add to the dictionaries."""
+    kept = [(names, dict(names)) for names in (FORMATS, METHODS, VIEWERS)]
+    yield
+    for names, before in kept:
+        names.clear()
+        names.update(before)  # type: ignore[arg-type]
+
+
+def recipe(title: str) -> dict[str, Any]:
+    """Run the Python blocks of a section of docs/extending.md; return the names they define."""
+    section = RECIPES.read_text().split(f"\n## {title}\n")[1].split("\n## ")[0]
+    blocks = re.findall(r"^```python\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    assert blocks, title
+    names: dict[str, Any] = {"__name__": f"recipe for {title}"}
+    for block in blocks:
+        exec(compile(block, f"{RECIPES.name}: {title}", "exec"), names)
+    return names
+
+
+def test_recipe_for_a_data_set(
+    registries: None, tmp_path: Path, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    recipe("A data set")
+    first, last = tiny_samples[0].timestamp - 0.1, tiny_samples[-1].timestamp
+    events, camera = tiny_sequence.events(first, last), tiny_sequence.camera
+    (tmp_path / "mine").mkdir()
+    np.savez(
+        tmp_path / "mine/recording.npz",
+        size=(camera.width, camera.height),
+        intrinsics=camera.intrinsics,
+        depth_times=[sample.timestamp for sample in tiny_samples],
+        depth=np.array([sample.depth for sample in tiny_samples]),
+        **{name: array for name, array in zip("xytp", (events.x, events.y, events.t, events.polarity))},
+    )
+    sequence = open_sequence(Config(scene="mine", data_dir=tmp_path))  # recognised
+    assert (sequence.dataset, sequence.scene) == ("npz", "mine")
+    samples = list(SampledSequence(sequence, 0.0, None, 0.1))
+    np.testing.assert_array_equal(samples[3].depth, tiny_samples[3].depth)
+    start = tiny_samples[0].T_world_camera
+    assert start is not None
+    config = settings(mapping={"enabled": False})
+    tracker, _ = METHODS["ed_slam"].build(sequence, ContrastThreshold(0.1, "data"), config)
+    slam = Slam(FrameBuilder(sequence.camera), tracker, None, start)
+    assert all(slam.process(sample).converged for sample in samples[:6])
+
+
+def test_recipe_for_a_tracker(
+    registries: None, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    recipe("A tracker")
+    slam = tracked(tiny_sequence, tiny_samples[:4], settings("constant_velocity"))
+    np.testing.assert_array_equal(slam.trajectory.pose(3), tiny_samples[0].T_world_camera)
+
+
+def test_recipe_for_a_mapper(
+    registries: None, tmp_path: Path, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    names = recipe("A mapper")
+    members = {name for name in vars(Mapper) if not name.startswith("_")}
+    assert members <= set(dir(names["PointMapper"]())), "the recipe lacks a part of the protocol"
+    slam = make_slam(tiny_sequence, tiny_samples, settings("points", poses="truth"))
+    for k, sample in enumerate(tiny_samples[:4]):
+        slam.process(sample, is_held_out=k == 2)
+    mapper = slam.mapper
+    assert mapper is not None
+    mapper.finish(slam.trajectory, lambda share: True)
+    assert len(mapper.points()[0]) == 3 * (80 // 8) * (120 // 8)  # every eighth pixel of three images
+    pose, depth = tiny_samples[2].T_world_camera, tiny_samples[2].depth
+    assert pose is not None
+    assert depth is not None
+    view = mapper.render(tiny_sequence.camera, pose)
+    error = np.abs(view.depth - depth)[view.alpha > 0]
+    assert np.median(error) < 0.02  # metres; a point falls half a pixel beside a centre
+    names["PointMapper"]().save(tmp_path)
+    assert (tmp_path / "points.npy").is_file()
+
+
+def test_recipe_for_a_loss() -> None:
+    loss = recipe("A loss")["opacity_loss"]
+    gaussians = GaussianMap(MappingConfig())
+    gaussians.add(torch.rand(5, 3), torch.rand(5, 4), 0.01 * torch.ones(5, 3), 0.7, 0.5 * torch.ones(5, 1))
+    values = []
+    for _ in range(20):
+        value = loss(gaussians.raw["logit_opacities"])
+        value.backward()
+        gaussians.step()
+        values.append(float(value))
+    assert values[0] == pytest.approx(0.7 * 0.3)
+    assert values[-1] < 0.8 * values[0]
+    mapper = (ROOT / "edslam_ti/mapping/gaussian_mapper.py").read_text()
+    assert re.search(r"loss = loss \+ config\.scale_weight \* scale_loss\(", mapper), (
+        "where the recipe points to"
+    )
+
+
+def test_recipe_for_a_viewer(
+    registries: None, tmp_path: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe("A viewer")
+    config = settings(
+        scene=tiny_folder.name,
+        dataset="event_replica",
+        data_dir=tiny_folder.parent,
+        duration=0.2,
+        visualize=True,
+        out=tmp_path,
+        mapping={"enabled": False},
+    )
+    run(config, Console(quiet=True))
+    printed = capsys.readouterr().out
+    assert "frame 2: camera at [" in printed
+    assert printed.rstrip().endswith("the run is saved")
+
+
 # --- tables ---
 
 
 def test_tables_are_what_the_stored_numbers_say() -> None:
-    report(ROOT, check=True)
+    report_tables(ROOT, check=True)
 
 
 def test_every_stored_table_is_shown_and_every_column_filled() -> None:
@@ -279,10 +418,10 @@ def test_a_new_number_appears_in_the_document(tmp_path: Path) -> None:
     table = {"columns": [{"key": "hz", "title": "Hz", "decimals": 0}], "rows": [row]}
     numbers.write_text(json.dumps(table))
     with pytest.raises(DataError, match=r"README.md; run the command without --check"):
-        report(tmp_path, check=True)
+        report_tables(tmp_path, check=True)
     assert write_tables(tmp_path) == [readme]
     assert readme.read_text() == ("before\n<!-- speed -->\n| Hz |\n|--:|\n| 3 |\n<!-- end speed -->\nafter\n")
-    report(tmp_path, check=True)
+    report_tables(tmp_path, check=True)
     del row["commit"]
     numbers.write_text(json.dumps(table))
     with pytest.raises(DataError, match=r"speed.json: row 1 does not state its commit"):

@@ -7,7 +7,6 @@ import tyro
 from rich.console import Console
 
 from edslam_ti.command_line import UsageError
-from edslam_ti.errors import DataError
 from edslam_ti.experiments.cases import EVERYTHING, Selection, all_cases, quick_cases
 
 
@@ -142,17 +141,9 @@ def report(root: Path = Path(), check: bool = False) -> None:
         root: checkout that holds README.md and docs/
         check: change nothing, and fail if a document differs from its numbers
     """
-    from edslam_ti.experiments.documents import differing_documents, write_tables
+    from edslam_ti.experiments.documents import report_tables
 
-    if check:
-        stale = differing_documents(root)
-        if stale:
-            names = ", ".join(str(path) for path in stale)
-            raise DataError(f"tables differ from docs/results: {names}; run the command without --check")
-        print("all tables agree with docs/results")
-        return
-    for document in write_tables(root):
-        print(f"{document}: tables written")
+    report_tables(root, check)
 
 
 COMMANDS = {"tracking": tracking, "ablations": ablations, "long_stream": long_stream, "report": report}

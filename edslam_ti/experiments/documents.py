@@ -28,6 +28,19 @@ PROVENANCE = ("command", "commit", "version", "source")  # what every row must s
 WHOLE_FROM = 10.0  # larger values need no decimals, in columns that ask for it
 
 
+def report_tables(root: Path, check: bool) -> None:
+    """Write the tables of all documents and print which changed; `check`: raise `DataError` instead."""
+    if check:
+        stale = differing_documents(root)
+        if stale:
+            names = ", ".join(str(path) for path in stale)
+            raise DataError(f"tables differ from docs/results: {names}; run the command without --check")
+        print("all tables agree with docs/results")
+        return
+    for document in write_tables(root):
+        print(f"{document}: tables written")
+
+
 def documents_in(root: Path) -> list[Path]:
     """Return the documents that hold tables; the frozen ones in docs/log hold their own."""
     found = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
