@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -18,12 +18,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from edslam_ti.viewer import VIEWERS
 from rich.console import Console
 from sequences import make_slam, settings, tracked
 
 from edslam_ti.config import Config, MappingConfig
-from edslam_ti.datasets import FORMATS, EventDepthSequence, Sample, SampledSequence, open_sequence
+from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence, open_sequence
 from edslam_ti.errors import DataError
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.experiments.documents import (
@@ -260,14 +259,15 @@ def test_commands_parse(document: Path) -> None:
 RECIPES = ROOT / "docs/extending.md"
 
 
-@pytest.fixture
-def registries() -> Iterator[None]:
-    """Put back what the recipes add to the dictionaries."""
-    kept = [(names, dict(names)) for names in (FORMATS, METHODS, VIEWERS)]
-    yield
-    for names, before in kept:
-        names.clear()
-        names.update(before)  # type: ignore[arg-type]
+@contextmanager
+def restored(registry: dict[str, Any]) -> Iterator[None]:
+    """Take out again what a recipe adds to a dictionary."""
+    before = dict(registry)
+    try:
+        yield
+    finally:
+        registry.clear()
+        registry.update(before)
 
 
 def recipe(title: str) -> dict[str, Any]:
@@ -282,61 +282,64 @@ def recipe(title: str) -> dict[str, Any]:
 
 
 def test_recipe_for_a_data_set(
-    registries: None, tmp_path: Path, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+    tmp_path: Path, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
-    recipe("A data set")
-    first, last = tiny_samples[0].timestamp - 0.1, tiny_samples[-1].timestamp
-    events, camera = tiny_sequence.events(first, last), tiny_sequence.camera
-    (tmp_path / "mine").mkdir()
-    np.savez(
-        tmp_path / "mine/recording.npz",
-        size=(camera.width, camera.height),
-        intrinsics=camera.intrinsics,
-        depth_times=[sample.timestamp for sample in tiny_samples],
-        depth=np.array([sample.depth for sample in tiny_samples]),
-        **{name: array for name, array in zip("xytp", (events.x, events.y, events.t, events.polarity))},
-    )
-    sequence = open_sequence(Config(scene="mine", data_dir=tmp_path))  # recognised
-    assert (sequence.dataset, sequence.scene) == ("npz", "mine")
-    samples = list(SampledSequence(sequence, 0.0, None, 0.1))
-    np.testing.assert_array_equal(samples[3].depth, tiny_samples[3].depth)
-    start = tiny_samples[0].T_world_camera
-    assert start is not None
-    config = settings(mapping={"enabled": False})
-    tracker, _ = METHODS["ed_slam"].build(sequence, ContrastThreshold(0.1, "data"), config)
-    slam = Slam(FrameBuilder(sequence.camera), tracker, None, start)
-    assert all(slam.process(sample).converged for sample in samples[:6])
+    from edslam_ti.datasets import FORMATS
+
+    with restored(FORMATS):
+        recipe("A data set")
+        first, last = tiny_samples[0].timestamp - 0.1, tiny_samples[-1].timestamp
+        events, camera = tiny_sequence.events(first, last), tiny_sequence.camera
+        (tmp_path / "mine").mkdir()
+        np.savez(
+            tmp_path / "mine/recording.npz",
+            size=(camera.width, camera.height),
+            intrinsics=camera.intrinsics,
+            depth_times=[sample.timestamp for sample in tiny_samples],
+            depth=np.array([sample.depth for sample in tiny_samples]),
+            **{name: array for name, array in zip("xytp", (events.x, events.y, events.t, events.polarity))},
+        )
+        sequence = open_sequence(Config(scene="mine", data_dir=tmp_path))  # recognised
+        assert (sequence.dataset, sequence.scene) == ("npz", "mine")
+        samples = list(SampledSequence(sequence, 0.0, None, 0.1))
+        np.testing.assert_array_equal(samples[3].depth, tiny_samples[3].depth)
+        start = tiny_samples[0].T_world_camera
+        assert start is not None
+        config = settings(mapping={"enabled": False})
+        tracker, _ = METHODS["ed_slam"].build(sequence, ContrastThreshold(0.1, "data"), config)
+        slam = Slam(FrameBuilder(sequence.camera), tracker, None, start)
+        assert all(slam.process(sample).converged for sample in samples[:6])
 
 
-def test_recipe_for_a_tracker(
-    registries: None, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
-) -> None:
-    recipe("A tracker")
-    slam = tracked(tiny_sequence, tiny_samples[:4], settings("constant_velocity"))
-    np.testing.assert_array_equal(slam.trajectory.pose(3), tiny_samples[0].T_world_camera)
+def test_recipe_for_a_tracker(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
+    with restored(METHODS):
+        recipe("A tracker")
+        slam = tracked(tiny_sequence, tiny_samples[:4], settings("constant_velocity"))
+        np.testing.assert_array_equal(slam.trajectory.pose(3), tiny_samples[0].T_world_camera)
 
 
 def test_recipe_for_a_mapper(
-    registries: None, tmp_path: Path, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+    tmp_path: Path, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
-    names = recipe("A mapper")
-    members = {name for name in vars(Mapper) if not name.startswith("_")}
-    assert members <= set(dir(names["PointMapper"]())), "the recipe lacks a part of the protocol"
-    slam = make_slam(tiny_sequence, tiny_samples, settings("points", poses="truth"))
-    for k, sample in enumerate(tiny_samples[:4]):
-        slam.process(sample, is_held_out=k == 2)
-    mapper = slam.mapper
-    assert mapper is not None
-    mapper.finish(slam.trajectory, lambda share: True)
-    assert len(mapper.points()[0]) == 3 * (80 // 8) * (120 // 8)  # every eighth pixel of three images
-    pose, depth = tiny_samples[2].T_world_camera, tiny_samples[2].depth
-    assert pose is not None
-    assert depth is not None
-    view = mapper.render(tiny_sequence.camera, pose)
-    error = np.abs(view.depth - depth)[view.alpha > 0]
-    assert np.median(error) < 0.02  # metres; a point falls half a pixel beside a centre
-    names["PointMapper"]().save(tmp_path)
-    assert (tmp_path / "points.npy").is_file()
+    with restored(METHODS):
+        names = recipe("A mapper")
+        members = {name for name in vars(Mapper) if not name.startswith("_")}
+        assert members <= set(dir(names["PointMapper"]())), "the recipe lacks a part of the protocol"
+        slam = make_slam(tiny_sequence, tiny_samples, settings("points", poses="truth"))
+        for k, sample in enumerate(tiny_samples[:4]):
+            slam.process(sample, is_held_out=k == 2)
+        mapper = slam.mapper
+        assert mapper is not None
+        mapper.finish(slam.trajectory, lambda share: True)
+        assert len(mapper.points()[0]) == 3 * (80 // 8) * (120 // 8)  # every eighth pixel of three images
+        pose, depth = tiny_samples[2].T_world_camera, tiny_samples[2].depth
+        assert pose is not None
+        assert depth is not None
+        view = mapper.render(tiny_sequence.camera, pose)
+        error = np.abs(view.depth - depth)[view.alpha > 0]
+        assert np.median(error) < 0.02  # metres; a point falls half a pixel beside a centre
+        names["PointMapper"]().save(tmp_path)
+        assert (tmp_path / "points.npy").is_file()
 
 
 def test_recipe_for_a_loss() -> None:
@@ -357,23 +360,25 @@ def test_recipe_for_a_loss() -> None:
     )
 
 
-def test_recipe_for_a_viewer(
-    registries: None, tmp_path: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe("A viewer")
-    config = settings(
-        scene=tiny_folder.name,
-        dataset="event_replica",
-        data_dir=tiny_folder.parent,
-        duration=0.2,
-        visualize=True,
-        out=tmp_path,
-        mapping={"enabled": False},
-    )
-    run(config, Console(quiet=True))
-    printed = capsys.readouterr().out
-    assert "frame 2: camera at [" in printed
-    assert printed.rstrip().endswith("the run is saved")
+def test_recipe_for_a_viewer(tmp_path: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+
+    from edslam_ti.viewer import VIEWERS
+
+    with restored(VIEWERS):
+        recipe("A viewer")
+        config = settings(
+            scene=tiny_folder.name,
+            dataset="event_replica",
+            data_dir=tiny_folder.parent,
+            duration=0.2,
+            visualize=True,
+            out=tmp_path,
+            mapping={"enabled": False},
+        )
+        run(config, Console(quiet=True))
+        printed = capsys.readouterr().out
+        assert "frame 2: camera at [" in printed
+        assert printed.rstrip().endswith("the run is saved")
 
 
 # --- tables ---
