@@ -354,10 +354,9 @@ def test_recipe_for_a_loss() -> None:
         values.append(float(value))
     assert values[0] == pytest.approx(0.7 * 0.3)
     assert values[-1] < 0.8 * values[0]
-    mapper = (ROOT / "edslam_ti/mapping/gaussian_mapper.py").read_text()
-    assert re.search(r"loss = loss \+ config\.scale_weight \* scale_loss\(", mapper), (
-        "where the recipe points to"
-    )
+    losses = (ROOT / "edslam_ti/mapping/losses.py").read_text()
+    line = r"total = total \+ config\.scale_weight \* scale_loss\("  # after which the recipe adds its own
+    assert re.search(line, losses.split("def map_loss(")[1].split("\ndef ")[0])
 
 
 def test_recipe_for_a_viewer(tmp_path: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
