@@ -209,6 +209,13 @@ def test_files_that_are_named_exist(document: Path) -> None:
         assert (ROOT / folder).is_dir(), f"{document.name} names {folder}"
 
 
+def test_every_format_is_described() -> None:
+    from edslam_ti.datasets import FORMATS
+
+    described = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/data.md").read_text(), re.MULTILINE)
+    assert FORMATS.keys() <= set(described)
+
+
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= README_LINES
 
