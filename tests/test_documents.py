@@ -414,6 +414,7 @@ def test_cells_show_values_as_their_columns_say() -> None:
         ([0.40, 0.42, 1.34, 0.61, 0.57], "0.57 (0.40 to 1.34)"),
         ({"mean": 2.6, "worst": 7.13}, "2.60 / 7.13"),
         ({"mean": 14, "worst": 124, "lost": True}, "14 / 124, lost frames"),
+        ({"mean": 0.6, "worst": 0.6, "lost": 3}, "0.60, 3 lost"),
         ({"mean": 0.8, "worst": 1.2, "lost": 3}, "0.80 / 1.20, 3 lost"),
     ):
         assert cell(value, column) == expected

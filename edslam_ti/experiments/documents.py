@@ -9,7 +9,7 @@ holds the columns in order, and the rows; every row says which command measured 
 
 A column of numbers states its "decimals" (with "whole_from_10": none from 10 on) or "significant" digits.
 A value is a text, a number, a list of numbers (one a seed: shown as median and range), an object {"mean",
-"worst", "lost"} over runs, or null where nothing was measured.
+"worst", "lost"} over runs (one number where they are equal), or null where nothing was measured.
 """
 
 import json
@@ -130,7 +130,8 @@ def cell(value: Any, column: Mapping[str, Any]) -> str:
     if isinstance(value, dict):
         lost = value.get("lost")  # a number of frames, or true where the source gives none
         note = "" if not lost else ", lost frames" if lost is True else f", {lost} lost"
-        return f"{shown(value['mean'])} / {shown(value['worst'])}{note}"
+        mean, worst = shown(value["mean"]), shown(value["worst"])
+        return (mean if mean == worst else f"{mean} / {worst}") + note
     return shown(value)
 
 
