@@ -48,8 +48,8 @@ ORDERS: dict[str, list[str]] = {
         *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
     ],
     "experiments": [
-        *("cases", "selection", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times"),
-        *("steps", "command"),
+        *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
+        *("kernel_times", "steps", "command"),
     ],
 }
 

@@ -24,7 +24,7 @@ from edslam_ti.pipeline import open_recording
 
 ROOT = Path(__file__).parents[1]
 APP = ROOT / "apps" / "slam.py"
-REPRODUCE = ["tracking", "ablations", "long_stream"]
+REPRODUCE = ["tracking", "ablations", "long_stream", "report"]
 
 
 @pytest.fixture

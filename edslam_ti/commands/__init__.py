@@ -13,7 +13,7 @@ COMMANDS = {
     "view": "show finished runs in a window, or draw them into a picture",
     "evaluate": "compare two trajectories, and a mesh with the true surfaces",
     "simulate": "write a simulated recording",
-    "reproduce": "measure over many recordings: tracking, ablations, long_stream",
+    "reproduce": "measure over many recordings: tracking, ablations, long_stream, report",
     "benchmark": "time the kernels beside alternatives",
 }
 

@@ -9,6 +9,7 @@ is kept too, so a run that was stopped goes on where it ended. Tables and pictur
     edslam reproduce tracking --methods ed_slam open3d_icp
     edslam reproduce ablations                                   one setting changed at a time
     edslam reproduce long_stream                                 time and memory along 60 s
+    edslam reproduce report                                      tables of README.md and docs/
 
 `edslam reproduce tracking --help` lists the options of a command.
 """

@@ -144,9 +144,26 @@ def long_stream(options: LongStreamOptions) -> None:
     print((options.out / "long_stream.md").read_text())
 
 
+class ReportOptions(Stage):
+    """Which documents."""
+
+    root: Path = Path()
+    """Checkout that holds README.md and docs/."""
+    check: bool = False
+    """Change nothing, and fail if a document differs from its numbers."""
+
+
+def report(options: ReportOptions) -> None:
+    """Write the tables of README.md and docs/*.md from the numbers in docs/results/*.json."""
+    from edslam_ti.experiments.documents import report_tables
+
+    report_tables(options.root, options.check)
+
+
 # command -> its options, and what it does with them
 COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
     "tracking": (TrackingOptions, tracking),
     "ablations": (AblationOptions, ablations),
     "long_stream": (LongStreamOptions, long_stream),
+    "report": (ReportOptions, report),
 }
