@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from edslam_ti.cold_start import load_kernels
 from edslam_ti.command_line import launch, parse_arguments
 from edslam_ti.errors import EdSlamError
 
@@ -46,6 +47,7 @@ def benchmark(
         duration: seconds of it
         out: folder that receives the results
     """
+    load_kernels()
     import torch  # torch and Taichi take seconds to load
 
     from edslam_ti import kernels

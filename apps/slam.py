@@ -13,6 +13,7 @@ results/<dataset>/<scene>/<method>/<time>/ (--out DIR replaces results), and `la
 from collections.abc import Sequence
 from pathlib import Path
 
+from edslam_ti.cold_start import load_kernels
 from edslam_ti.command_line import launch, parse_config
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -20,6 +21,7 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 def main(argv: Sequence[str] | None = None) -> None:
     config = parse_config(argv, CONFIGS, description=__doc__)
+    load_kernels()
     from edslam_ti.pipeline import run  # after the settings: torch and Taichi take seconds to load
 
     run(config)

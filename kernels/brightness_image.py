@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.patch_warp import Patches
 from edslam_ti.kernels.runtime import check_shape

@@ -12,9 +12,9 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import float_dtype
 
 LANES = 16

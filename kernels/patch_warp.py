@@ -24,9 +24,9 @@ pixel by pixel.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 

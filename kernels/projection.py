@@ -17,10 +17,10 @@ on a GPU the same functions work on one Gaussian per thread.
 
 from dataclasses import dataclass
 
-import taichi as ti
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import (
     LANES,
     SUMS,

@@ -6,11 +6,11 @@ atomically, so that sums may differ in their last bits from run to run. Sorting 
 on the device; the number of (Gaussian, tile) pairs is read back once a view, to allocate their lists.
 """
 
-import taichi as ti
 import torch
 from torch import Tensor
 
 from edslam_ti.kernels.compositing import draw, draw_backward
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES
 from edslam_ti.kernels.projection import (
     BLOCK,

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import spsolve
 from edslam_ti import kernels
 from edslam_ti.camera import Camera
 from edslam_ti.event_images.solve import HUBER, Observation, solve_log_brightness_image
-from edslam_ti.geometry import exp_matrix
+from edslam_ti.geometry import se3_exp
 from edslam_ti.kernels.brightness_image import ChangeImage, Pair, solve_brightness_image
 
 CAMERA = Camera(41, 30, 36.0, 36.0, 20.0, 14.5)  # 41 x 30 pixels are no multiple of the lanes
@@ -31,7 +31,7 @@ def observations(count: int = 5) -> list[Observation]:
     twists = RANDOM.normal(0, 0.04, (count, 6))
     changes = RANDOM.normal(0, 0.3, (count, *CAMERA.shape)).astype(np.float32)
     return [
-        Observation(exp_matrix(twist), change, None if k % 2 else scene())
+        Observation(se3_exp(twist), change, None if k % 2 else scene())
         for k, (twist, change) in enumerate(zip(twists, changes))
     ]
 
@@ -107,7 +107,7 @@ def test_equations_of_any_two_images_with_known_ones_among_them() -> None:
     depths = [measured, measured, None, measured]
     images = [ChangeImage(change, depth, k == 1) for k, (change, depth) in enumerate(zip(changes, depths))]
     chosen = [(0, 1), (1, 0), (0, 2), (2, 0), (3, 1), (0, 3)]
-    pairs = [Pair(*two, exp_matrix(RANDOM.normal(0, 0.04, 6))) for two in chosen]
+    pairs = [Pair(*two, se3_exp(RANDOM.normal(0, 0.04, 6))) for two in chosen]
     robust = (False, True)
     systems = [
         equations(images[p.first], images[p.second], p.T_second_first, True) for p in pairs if p.first != 2
@@ -123,11 +123,11 @@ def test_equations_of_any_two_images_with_known_ones_among_them() -> None:
     np.testing.assert_array_equal(level[~is_observed], prior[~is_observed])
 
 
-def test_image_is_the_same_for_any_number_of_threads() -> None:
+def test_image_is_the_same_for_any_number_of_threads(device: str) -> None:
     prior, seen = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32), observations()
     images = []
     for threads in (1, 2, 2):  # 2 is what the other tests run with
-        kernels.init(threads=threads)
+        kernels.init(device, threads=threads)
         images.append(solved(prior, seen, 12, True))
         solved(-prior, observations(), 12, True)  # leaves nothing behind
     assert np.array_equal(images[0], images[1])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edslam_ti.camera import Camera
-from edslam_ti.geometry import exp_matrix, rigid_inverse
+from edslam_ti.geometry import inverse, se3_exp
 from edslam_ti.kernels.depth_average import DepthAgreement, PixelRays, average_depth
 
 CAMERA = Camera(41, 30, 36.0, 34.0, 20.0, 14.5)  # 41 x 30 pixels are no multiple of the lanes
@@ -24,7 +24,7 @@ def plane(T_world_camera: np.ndarray) -> np.ndarray:  # [H, W] metres
 
 
 def poses(count: int, size: float = 0.03) -> list[np.ndarray]:
-    return [exp_matrix(twist) for twist in np.random.default_rng(3).normal(0, size, (count, 6))]
+    return [se3_exp(twist) for twist in np.random.default_rng(3).normal(0, size, (count, 6))]
 
 
 def averaged_by_loops(depth: np.ndarray, others: list[np.ndarray], motions: list[np.ndarray]) -> np.ndarray:
@@ -69,7 +69,7 @@ def test_noise_averages_out() -> None:
     random, T_world_camera = np.random.default_rng(1), poses(6)
     truth = [plane(T) for T in T_world_camera]
     noisy = [d + random.normal(0, 0.008, d.shape).astype(np.float32) for d in truth]
-    motions = [rigid_inverse(T) @ T_world_camera[0] for T in T_world_camera[1:]]
+    motions = [inverse(T) @ T_world_camera[0] for T in T_world_camera[1:]]
     average = averaged(noisy[0], noisy[1:], motions)
     inner = np.s_[6:-6, 6:-6]
     before, after = (np.std((d - truth[0])[inner]) for d in (noisy[0], average))

@@ -203,11 +203,11 @@ def test_directions_linearised_together_are_those_linearised_alone() -> None:
         assert (together[k].cost, together[k].num_usable) == (alone.cost, alone.num_usable)
 
 
-def test_normal_equations_have_the_same_bits_for_any_number_of_threads() -> None:
+def test_normal_equations_have_the_same_bits_for_any_number_of_threads(device: str) -> None:
     T = make_motion(0.02)
     systems = []
     for threads in (1, 3, 2):
-        kernels.init("cpu", threads=threads)
+        kernels.init(device, threads=threads)
         systems.append(make_alignment((900, 300)).linearise([T, np.linalg.inv(T)]))
     for others in systems[1:]:
         for ours, other in zip(systems[0], others):

@@ -111,7 +111,7 @@ def test_both_match_the_torch_twin_in_double_precision() -> None:
     assert_same(with_gradients(view.loss, inputs), theirs, 1e-9)
 
 
-def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter() -> None:
+def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter(device: str) -> None:
     inputs, (measured, _) = [*make_map(300), make_poses()], images()
 
     def run(**options: int) -> list[torch.Tensor]:
@@ -120,11 +120,11 @@ def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter() -> No
     first = run()
     assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
     assert_same(run(tile=8), first, 1e-5)
-    kernels.init("cpu", threads=1)
+    kernels.init(device, threads=1)
     try:
         assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
     finally:
-        kernels.init("cpu", threads=2)
+        kernels.init(device, threads=2)
 
 
 def test_a_view_of_nothing_has_zero_gradients() -> None:
