@@ -4,21 +4,17 @@ Time the kernels, and steps of a run, beside alternatives (torch, numpy, and num
 installed) in turn in one process, and print a Markdown table; "limit" is the least time this machine could
 take. What takes more than two seconds a call is timed once. --out FOLDER also writes benchmark.md and
 benchmark.json there, and scaling.png for the suite `scaling`.
+
+    python apps/benchmark.py --engines taichi quadrants           both engines of the kernels, a column each
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from edslam_ti.cold_start import load_kernels
 from edslam_ti.command_line import launch, parse_arguments
-from edslam_ti.errors import EdSlamError
-
-Suite = Literal["time_surface", "tracking", "rasterizer", "mapping_step", "cold_start", "slam", "scaling"]
-KERNELS: tuple[Suite, ...] = ("time_surface", "tracking", "rasterizer", "mapping_step")
-HEADER = (
-    "| task | | wall ms | CPU ms | wall / first | CPU / first | limit ms |\n|---|---|--:|--:|--:|--:|--:|"
-)
+from edslam_ti.experiments.benchmark import KERNELS, Engine, Suite
+from edslam_ti.experiments.benchmark import benchmark as run
 
 
 def benchmark(
@@ -29,6 +25,7 @@ def benchmark(
     rounds: int = 7,
     threads: int = 2,
     device: Literal["cpu", "cuda"] = "cpu",
+    engines: tuple[Engine, ...] = (),
     scene: str = "office0",
     duration: float = 1.0,
     out: Path | None = None,
@@ -43,42 +40,12 @@ def benchmark(
         rounds: timings of each candidate, of which the median counts; one of those that take over two seconds
         threads: CPU threads of the kernels and of torch
         device: where the kernels run; alternatives stay on the CPU
+        engines: engines of the kernels, the first in this process; none: the one of EDSLAM_ENGINE, or taichi
         scene: sequence of the suite slam
         duration: seconds of it
         out: folder that receives the results
     """
-    load_kernels()
-    import torch  # torch and Taichi take seconds to load
-
-    from edslam_ti import kernels
-    from edslam_ti.experiments import kernel_times as timed
-    from edslam_ti.experiments import steps
-
-    try:
-        kernels.init(device, threads=threads)
-    except RuntimeError as error:  # no such device
-        raise EdSlamError(str(error)) from error
-    torch.set_num_threads(threads)
-    watch = timed.Stopwatch(rounds)
-    machine = f"{timed.processor()}, {threads} threads, torch {torch.__version__}, kernels on {device}"
-    limits = f"{watch.bytes_per_second / 1e9:.3g} GB/s copied, {watch.flops_per_second / 1e9:.3g} GFLOP/s"
-    lines = [f"{machine}; medians of {rounds}; {limits}", ""]
-    lines += [HEADER] if set(suites) - {"scaling"} else []
-    print("\n".join(lines))
-    results = []
-    for row in steps.rows(suites, sizes, gaussians, events, (scene, duration), watch, device):
-        results.append(row)
-        lines.append(row.as_markdown())
-        print(lines[-1], flush=True)
-    curves: list[steps.Curve] = []
-    if "scaling" in suites:
-        alone = timed.Stopwatch(rounds, has_alternatives=False)
-        curves += steps.scaling(sizes, gaussians, events, range(1, threads + 1), alone)
-        table = steps.scaling_table(curves)
-        lines += table
-        print("\n".join(table))
-    if out is not None:
-        steps.write(out, machine, lines, results, curves)
+    run(suites, sizes, gaussians, events, rounds, threads, device, engines, scene, duration, out)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -46,7 +46,7 @@ ORDERS: dict[str, list[str]] = {
     "results": ["pictures", "export", "plots", "folder"],
     "experiments": [
         *("cases", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times", "steps"),
-        "command",
+        *("benchmark", "command"),
     ],
 }
 
@@ -67,7 +67,7 @@ LIBRARIES: dict[str, list[str]] = {
     "lpips": ["evaluation"],
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
-    "matplotlib": ["results", "experiments.steps"],
+    "matplotlib": ["results"],
     "rich": ["datasets", "results", "pipeline", "experiments", "apps"],
     "psutil": ["experiments.long_stream"],
     "tyro": ["command_line", "experiments", "apps"],

@@ -25,6 +25,7 @@ from torch.autograd import forward_ad
 from edslam_ti.kernels import brightness_image, depth_average, patch_warp, reference
 from edslam_ti.kernels import time_surface as surfaces
 from edslam_ti.kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from edslam_ti.kernels.engine import ENGINE
 from edslam_ti.kernels.patch_warp import (
     NEAR,
     Alignment,
@@ -40,7 +41,7 @@ from edslam_ti.kernels.runtime import is_gpu, synchronize
 from edslam_ti.kernels.time_surface import MANY_EVENTS, time_surface, update_last_timestamps
 from edslam_ti.kernels.view_losses import compare_change, compare_view
 
-OURS = "Taichi"
+OURS = ENGINE.capitalize()  # in the names of rows
 TWIN_LIMIT = 3e7  # Gaussians times pixels that the torch twin still manages, all at once
 DV_LIMIT = 2_000_000  # events: dv-processing takes them from Python one by one
 NUM_PATCHES, PATCH_SIZE = 400, 9
@@ -460,7 +461,7 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
     ]
     candidates = {
         OURS: lambda: linearise(additive),
-        "Taichi, inverse compositional": lambda: linearise(compositional),
+        f"{OURS}, inverse compositional": lambda: linearise(compositional),
         "numpy": lambda: [linearise_in_numpy(*each) for each in arguments],
         "torch twin": lambda: [linearise_in_torch(*each) for each in arguments],
     }
@@ -513,7 +514,7 @@ def cold_start(threads: int, rounds: int) -> Iterator[Row]:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         samples.append(np.diff(json.loads(done.stdout.splitlines()[-1]), axis=0))
     parts = 1e3 * np.median(samples, axis=0)  # of three or more, as the first may have filled the cache
-    names = ("import", "start Taichi", "compile every kernel")
+    names = ("import", f"start {OURS}", "compile every kernel")
     total = parts.sum(0)
     for name, (wall, cpu) in zip(("all", *names), [total, *parts]):
         ratios = float(wall / total[0]), float(cpu / total[1])
