@@ -26,7 +26,11 @@ Engine = Literal["taichi", "quadrants"]
 KERNELS: tuple[Suite, ...] = ("time_surface", "tracking", "rasterizer", "mapping_step")
 WHOLE_RUNS = ("cold_start", "slam")  # suites of which every row depends on the engine
 
-CHILD = "import json, sys; from edslam_ti.experiments.benchmark import benchmark as b; b(**json.loads(sys.argv[1]))"
+CHILD = """
+import json, sys
+from edslam_ti.experiments.benchmark import benchmark
+benchmark(**json.loads(sys.argv[1]))
+"""
 
 
 def benchmark(
@@ -63,7 +67,7 @@ def benchmark(
         "suites": suites, "sizes": sizes, "gaussians": gaussians, "events": events, "rounds": rounds,
         "threads": threads, "device": device, "scene": scene, "duration": duration,
     }  # fmt: skip
-    others = {engine: _in_child(engine, settings) for engine in engines if engine != ENGINE}
+    others: dict[str, Any] = {engine: _in_child(engine, settings) for engine in engines if engine != ENGINE}
     watch = timed.Stopwatch(rounds)
     machine = (
         f"{timed.processor()}, {threads} threads, torch {torch.__version__}, "
@@ -131,10 +135,9 @@ def _columns(row: "Row", others: Mapping[str, Sequence[Mapping[str, Any]]]) -> s
         name = row.name
         if row.suite not in WHOLE_RUNS:
             name = name.replace(OURS, engine.capitalize()) if name.startswith(OURS) else ""
-        same = [
-            r["wall_ms"] for r in rows if (r["suite"], r["task"], r["name"]) == (row.suite, row.task, name)
-        ]
-        text += f" {same[0]:.3g} |" if same else "  |"
+        times = {(r["suite"], r["task"], r["name"]): r["wall_ms"] for r in rows}
+        wall_ms = times.get((row.suite, row.task, name))
+        text += "  |" if wall_ms is None else f" {wall_ms:.3g} |"
     return text
 
 
