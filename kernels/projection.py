@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.constants import NEAR
 from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import (
     LANES,
@@ -33,7 +34,6 @@ from edslam_ti.kernels.lanes import (
 )
 from edslam_ti.kernels.runtime import CHUNK, float_dtype, plain, workers
 
-NEAR = 0.05  # metres; nearer Gaussians are culled
 LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian ends where its alpha falls below this
 NOT_DRAWN = -1  # in place of the depth bits, which are positive

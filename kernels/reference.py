@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from edslam_ti.kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE
-from edslam_ti.kernels.patch_warp import ResidualModel
-from edslam_ti.kernels.projection import LOW_PASS, MIN_ALPHA, NEAR
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.patch_warp import MAX_SLOPE, ResidualModel
+from edslam_ti.kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA
 from edslam_ti.kernels.rasterization import Rasterization
 
 # --- time surface ---
@@ -73,7 +74,7 @@ def alignment_residuals(
     r_depth = warped[:, 2] - sample_bilinear(depth, warped)
     keep = ~has_depth | (r_depth.abs() < model.max_depth_difference)
     r_surface = (sample_bilinear(surface, warped) - values)[keep] / model.surface_sigma
-    is_smooth = corners.amax(-1) - corners.amin(-1) < 0.05 * corners.amax(-1)
+    is_smooth = corners.amax(-1) - corners.amin(-1) < MAX_SLOPE * corners.amax(-1)
     sigma = model.depth_sigma + model.depth_sigma_2 * warped[:, 2].detach() ** 2
     return r_surface, (r_depth / sigma)[keep & has_depth & is_smooth]
 
@@ -111,6 +112,11 @@ def project(
     return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariances, z
 
 
+def _is_near(position: Tensor, size: int) -> Tensor:
+    """Return whether a mean is near enough to the image for the affine approximation of Eq. 7."""
+    return (position > -MARGIN * size) & (position < (1 + MARGIN) * size)
+
+
 def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor,
     T_camera_world: Tensor, intrinsics: tuple[float, ...], size: tuple[int, int],
@@ -124,7 +130,7 @@ def rasterize(
         means[front], quats[front], scales[front], T_camera_world, intrinsics
     )
     u, v = means_2d.detach().unbind(-1)
-    near_image = (u > -0.3 * width) & (u < 1.3 * width) & (v > -0.3 * height) & (v < 1.3 * height)
+    near_image = _is_near(u, width) & _is_near(v, height)
     order = depths.detach().float().argsort(stable=True)
     order = order[near_image[order]]
     index = front[order]

@@ -22,17 +22,18 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from edslam_ti.geometry import adjoint
 from edslam_ti.kernels import brightness_image, depth_average, patch_warp, reference
 from edslam_ti.kernels import time_surface as surfaces
 from edslam_ti.kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from edslam_ti.kernels.constants import NEAR
 from edslam_ti.kernels.engine import ENGINE
 from edslam_ti.kernels.patch_warp import (
-    NEAR,
+    MAX_SLOPE,
     Alignment,
     Direction,
     Patches,
     ResidualModel,
-    adjoint,
     extract_patches,
 )
 from edslam_ti.kernels.projection import MIN_ALPHA
@@ -196,7 +197,7 @@ def rasterize_pairs(
         limits = torch.tensor([width - 1, height - 1])
         low = (centres - half).ceil().long().clamp_min(0)
         sides = (torch.minimum((centres + half).floor().long(), limits) - low + 1).clamp_min(0)
-        counts = sides.prod(1) * ((depths > 0.05) & (extent > 0))
+        counts = sides.prod(1) * ((depths > NEAR) & (extent > 0))
         order = depths.argsort(stable=True)
         g = order.repeat_interleave(counts[order])
         starts = counts[order].cumsum(0) - counts[order]
@@ -346,7 +347,10 @@ def linearise_in_numpy(
     patches: Patches, surface: np.ndarray, depth: np.ndarray, T_b_a: np.ndarray,
     intrinsics: tuple[float, ...], model: ResidualModel, inverse: bool,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """H [6, 6] and g [6] of `kernels.patch_warp.normal_equations`, in numpy."""
+    """Return H [6, 6] and g [6] of `kernels.patch_warp.Alignment`, computed in numpy.
+
+    The unknown updates T_b_a <- exp(xi) T_b_a; if `inverse`, it updates T_a_b <- exp(xi) T_a_b.
+    """
     fx, fy, cx, cy = intrinsics
     T = T_b_a.astype(np.float32)
     x, y, rho = patches.pixels[patches.pixels[:, 2] > 0].T
@@ -372,7 +376,7 @@ def linearise_in_numpy(
     r_depth = p[:, 2] - d
     has_depth, highest = corners.min(1) > NEAR, corners.max(1)
     keep = ~has_depth | (np.abs(r_depth) < model.max_depth_difference)
-    is_smooth = keep & has_depth & (highest - corners.min(1) < 0.05 * highest)
+    is_smooth = keep & has_depth & (highest - corners.min(1) < MAX_SLOPE * highest)
     zero = np.zeros_like(inv_z)
     du = np.stack([fx * inv_z, zero, -fx * p[:, 0] * inv_z**2], -1)
     dv = np.stack([zero, fy * inv_z, -fy * p[:, 1] * inv_z**2], -1)
@@ -453,6 +457,11 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
 
     def linearise(alignment: Alignment) -> object:
         forward, backward = alignment.linearise(poses)
+        if alignment.is_compositional:  # exp(xi) T = T exp(Ad(T^-1) xi)
+            forward, backward = (
+                system.transformed(np.linalg.inv(adjoint(pose)))
+                for system, pose in zip((forward, backward), poses)
+            )
         return forward + backward.transformed(-adjoint(poses[1]))
 
     arguments = [

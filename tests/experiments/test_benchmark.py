@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from patches import normal_equations
 
 import edslam_ti.experiments.steps
 from apps.benchmark import main
@@ -27,7 +28,7 @@ from edslam_ti.experiments.kernel_times import (
 )
 from edslam_ti.experiments.steps import Curve, mapping_step, slam
 from edslam_ti.kernels.engine import ENGINE, ENGINES, VERSION
-from edslam_ti.kernels.patch_warp import ResidualModel, normal_equations
+from edslam_ti.kernels.patch_warp import ResidualModel
 from edslam_ti.kernels.projection import MIN_ALPHA
 from edslam_ti.kernels.rasterization import rasterize
 from edslam_ti.kernels.reference import project

@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.constants import NEAR
 from edslam_ti.kernels.culling import REACH, drawable
-from edslam_ti.kernels.projection import LOW_PASS, MARGIN, NEAR
+from edslam_ti.kernels.projection import LOW_PASS, MARGIN
 
 INTRINSICS, SIZE = (40.0, 42.0, 31.5, 23.5), (64, 48)
 
