@@ -331,7 +331,7 @@ class Alignment:
         intrinsics: tuple[float, float, float, float],
     ) -> None:
         check_shape("views", views, (None, None, None, 2))
-        self._views = np.ascontiguousarray(views, _numpy_float())
+        self._views: np.ndarray = np.ascontiguousarray(views, _numpy_float())
         points = [direction.points.numpy() for direction in directions]
         rows = points[0].shape[1] if points else POINT_SIZE
         self.is_compositional = rows > POINT_SIZE
@@ -340,9 +340,9 @@ class Alignment:
         else:
             self._points = torch.empty(sum(map(len, points)), rows, LANES, dtype=float_dtype())
             np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
-        self._jobs = np.empty((len(directions), JOB_SIZE), _numpy_float())
+        self._jobs: np.ndarray = np.empty((len(directions), JOB_SIZE), _numpy_float())
         self._parts: list[slice] = []
-        bounds = []
+        bounds: list[tuple[int, int, int, int]] = []
         begin = 0
         for job, direction in enumerate(directions):
             if not 0 <= direction.view < len(views):
@@ -357,7 +357,7 @@ class Alignment:
                 model.depth_weight, model.depth_sigma, model.depth_sigma_2, model.huber_threshold,
             )  # fmt: skip
         self._bounds = np.array(bounds, np.int32).reshape(-1, 4)
-        self._sums = np.empty((len(bounds), SUM_SIZE), _numpy_float())
+        self._sums: np.ndarray = np.empty((len(bounds), SUM_SIZE), _numpy_float())
 
     def linearise(self, poses: list[np.ndarray]) -> "list[NormalEquations]":  # T_b_a [4, 4] of each direction
         """Return the Gauss-Newton system of Eq. 5 for each direction, in the unknown that the class names."""
@@ -382,7 +382,7 @@ class Alignment:
 
 def compile_kernels() -> None:
     """Compile what tracking needs, so that the first frames of a sequence need not wait for it."""
-    image = np.zeros((2, 2), _numpy_float())
+    image: np.ndarray = np.zeros((2, 2), _numpy_float())
     patches = extract_patches(image, image, np.zeros((1, 2), np.int32), 1)
     intrinsics = (1.0, 1.0, 0.0, 0.0)
     direction = Direction(patches.points(intrinsics), 0, ResidualModel())

@@ -198,7 +198,8 @@ def simulate_events(
     width = L0.shape[1]
     pixel = torch.arange(L0.numel()).view(L0.shape)
     p = torch.sign(L1 - L0)
-    base = torch.where(p > 0, *(torch.full_like(L0, c) for c in thresholds))
+    brighter, darker = thresholds
+    base = torch.where(p > 0, torch.full_like(L0, brighter), torch.full_like(L0, darker))
     level, k, last = reference.clone(), num_crossings.clone(), last_event.clone()
     events = []
     while True:

@@ -309,7 +309,7 @@ def _compare(
 
 
 def _compare_rendered(
-    gaussians: tuple[Tensor, ...], poses: Tensor,
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor], poses: Tensor,
     intrinsics: tuple[float, float, float, float], size: tuple[int, int],
     target: Tensor, target_depth: Tensor, weights: tuple[float, float],
     background: float, epsilon: float, low_pass: float,

@@ -1,5 +1,6 @@
 """What `apps/reproduce.py` does: its commands, and what each of them takes."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -134,4 +135,8 @@ def long_stream(
     print((out / "long_stream.md").read_text())
 
 
-COMMANDS = {"tracking": tracking, "ablations": ablations, "long_stream": long_stream}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "tracking": tracking,
+    "ablations": ablations,
+    "long_stream": long_stream,
+}

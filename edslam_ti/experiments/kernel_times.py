@@ -13,7 +13,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,7 +53,9 @@ FLOPS_FORWARD, FLOPS_BACKWARD = 30, 48  # of a (pixel, Gaussian) pair
 FLOPS_LINEARISE = 230  # of a patch pixel: warp, two samples, two Jacobians, 2 x 27 sums
 
 Candidates = Mapping[str, Callable[[], object]]
-Scene = tuple[list[Tensor], tuple[float, float, float, float]]  # inputs of `rasterize`, intrinsics
+Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # of `rasterize`: five of Gaussians, the pose
+Render = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ def _finish_device() -> None:
 # --- rasterizer ---
 
 
-def room_scene(n: int, width: int, height: int, seed: int = 0) -> Scene:
+def room_scene(n: int, width: int, height: int, seed: int = 0) -> tuple[Inputs, Intrinsics]:
     """Gaussians of about 1.2 pixels on the walls of a room 5 x 2.6 x 4.5 m, seen from its middle."""
     rng = np.random.default_rng(seed)
     focal = 0.8 * width
@@ -180,7 +182,12 @@ def room_scene(n: int, width: int, height: int, seed: int = 0) -> Scene:
     tensors = [torch.from_numpy(x.astype(np.float32)) for x in inputs]
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.02, -0.01, 0.03])
-    return [*tensors, pose], (focal, focal, width / 2, height / 2)
+    return _inputs([*tensors, pose]), (focal, focal, width / 2, height / 2)
+
+
+def _inputs(tensors: Iterable[Tensor]) -> Inputs:
+    means, quats, scales, opacities, colors, pose = tensors
+    return means, quats, scales, opacities, colors, pose
 
 
 def rasterize_pairs(
@@ -221,7 +228,7 @@ def rasterize_pairs(
     return image, depth[..., 0], total[..., 0]
 
 
-def count_pairs(inputs: list[Tensor], intrinsics: tuple[float, ...], size: tuple[int, int]) -> int:
+def count_pairs(inputs: Inputs, intrinsics: tuple[float, ...], size: tuple[int, int]) -> int:
     """Return how many (pixel, Gaussian) pairs the Gaussians in view have, hidden ones included."""
     means, quats, scales, opacities, _, pose = inputs
     centres, covariances, depths = reference.project(means, quats, scales, pose, intrinsics)
@@ -235,25 +242,25 @@ def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str 
     """Render a view; render it and compute all gradients, pose included."""
     inputs, intrinsics = room_scene(count, *size)
     pairs = count_pairs(inputs, intrinsics, size)
-    inputs = [x.to(device) for x in inputs]
+    inputs = _inputs(x.to(device) for x in inputs)
     cotangent = torch.randn(size[1], size[0], generator=torch.Generator().manual_seed(0)).to(device)
 
     def kernel(*tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        view = rasterize(*tensors, intrinsics, size)
+        view = rasterize(*_inputs(tensors), intrinsics, size)
         return view.image, view.depth, view.alpha
 
     def twin(*tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        view = reference.rasterize(*tensors, intrinsics, size)
+        view = reference.rasterize(*_inputs(tensors), intrinsics, size)
         return view.image, view.depth, view.alpha
 
-    def gradients(render: Callable[..., tuple[Tensor, ...]]) -> object:
-        tensors = [x.clone().requires_grad_() for x in inputs]
-        loss = sum((image.squeeze(-1) * cotangent).sum() for image in render(*tensors))
+    def gradients(render: Render) -> object:
+        tensors = _inputs(x.clone().requires_grad_() for x in inputs)
+        loss = torch.stack([(image.squeeze(-1) * cotangent).sum() for image in render(*tensors)]).sum()
         return torch.autograd.grad(loss, tensors)
 
-    renders = {OURS: kernel}
+    renders: dict[str, Render] = {OURS: kernel}
     if device == "cpu":  # the alternatives make tensors on the CPU
-        renders["torch pair list"] = lambda *x: rasterize_pairs(*x, intrinsics, size)
+        renders["torch pair list"] = lambda *x: rasterize_pairs(*_inputs(x), intrinsics, size)
         if size[0] * size[1] * count <= TWIN_LIMIT:
             renders["torch twin"] = twin
     task = f"{size[0]}x{size[1]}, {count} Gaussians"
@@ -278,10 +285,10 @@ def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row
     last = np.full((size[1], size[0]), -np.inf)
     everywhere = [rng.integers(0, n, count).astype(np.int16) for n in size]
     task = f"{size[0]}x{size[1]}, {count} events"
-    yield from _update(f"{task}: update", *everywhere, t, last, watch)
+    yield from _update(f"{task}: update", everywhere, t, last, watch)
     # Most of them in the middle, none at all in the corners
     middle = [np.clip(rng.normal(n / 2, n / 6, count), 0, n - 1).astype(np.int16) for n in size]
-    yield from _update(f"{task}, most in the middle: update", *middle, t, last, watch)
+    yield from _update(f"{task}, most in the middle: update", middle, t, last, watch)
     evaluations = {
         OURS: lambda: time_surface(last, 1.0, 0.03),
         "torch twin": lambda: reference.time_surface(torch.from_numpy(last), 1.0, 0.03),
@@ -292,14 +299,15 @@ def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row
 
 def _update(
     task: str,
-    x: np.ndarray,  # [N] int16
-    y: np.ndarray,  # [N] int16
+    places: Sequence[np.ndarray],  # x and y, [N] int16 each
     t: np.ndarray,  # [N] float64 seconds
     last: np.ndarray,  # [H, W] float64 seconds
     watch: Stopwatch,
 ) -> Iterator[Row]:
     """Take in a batch of events."""
-    size = last.shape[::-1]
+    x, y = places
+    height, width = last.shape
+    x_of_twin, y_of_twin, t_of_twin = map(torch.from_numpy, (x, y, t))
 
     def assign() -> None:
         last[y, x] = t
@@ -307,13 +315,13 @@ def _update(
     updates = {
         OURS: lambda: update_last_timestamps(x, y, t, last),
         "numpy last[y, x] = t": assign,
-        "torch twin": lambda: reference.last_timestamps(*map(torch.from_numpy, (x, y, t)), last.shape),
+        "torch twin": lambda: reference.last_timestamps(x_of_twin, y_of_twin, t_of_twin, (height, width)),
     }
     if importlib.util.find_spec("numba"):
         compiled = _numba_assignment()
         updates["numba"] = lambda: compiled(x, y, t, last)
     if watch.has_alternatives and importlib.util.find_spec("dv_processing") and len(t) <= DV_LIMIT:
-        updates["dv-processing"] = _dv_update(x, y, t, size)
+        updates["dv-processing"] = _dv_update(x, y, t, (width, height))
     newest = min(len(t), last.size)  # times that are needed
     work = Work(x.nbytes + y.nbytes + (t.itemsize + last.itemsize) * newest)
     yield from watch.compare("time_surface", task, updates, work)
@@ -402,7 +410,8 @@ def linearise_in_torch(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """The same from the torch twin's residuals, by forward differentiation along the six twists."""
     arrays = (patches.pixels, patches.values, surface, depth)
-    inputs, T = [torch.from_numpy(array) for array in arrays], torch.from_numpy(T_b_a).float()
+    pixels, values, image, depths = map(torch.from_numpy, arrays)
+    T = torch.from_numpy(T_b_a).float()
     columns: tuple[list[Tensor], list[Tensor]] = ([], [])
     residuals: tuple[Tensor, ...] = ()
     for generator in torch.from_numpy(_GENERATORS).float():
@@ -410,7 +419,9 @@ def linearise_in_torch(
             moved = forward_ad.make_dual(T, -T @ generator if inverse else generator @ T)
             duals = [
                 forward_ad.unpack_dual(r)
-                for r in reference.alignment_residuals(*inputs, moved, intrinsics, model)
+                for r in reference.alignment_residuals(
+                    pixels, values, image, depths, moved, intrinsics, model
+                )
             ]
             residuals = tuple(dual.primal for dual in duals)
             for column, dual in zip(columns, duals):
@@ -502,11 +513,11 @@ print(json.dumps(stamps))
 def run_every_kernel() -> None:
     """Run what a run of SLAM runs, on next to nothing: afterwards all of it is compiled."""
     inputs, intrinsics = room_scene(20, 16, 12)
-    tensors = [x.requires_grad_() for x in inputs]
-    view = rasterize(*tensors, intrinsics, (16, 12))
+    view = rasterize(*_inputs(x.requires_grad_() for x in inputs), intrinsics, (16, 12))
     (view.image.sum() + view.depth.sum()).backward()
     target, poses = torch.zeros(12, 16), torch.stack([inputs[-1]] * 2)
-    scene = [x.detach() for x in inputs[:-1]]
+    means, quats, scales, opacities, colors, _ = _inputs(x.detach() for x in inputs)
+    scene = means, quats, scales, opacities, colors
     compare_change(*scene, poses, intrinsics, (16, 12), target, 0.5, 0.01, 1.0)
     compare_view(*scene, poses[0], intrinsics, (16, 12), target, target, 0.5, 0.01, 1.0, 1.0)
     for module in (patch_warp, brightness_image, depth_average, surfaces):

@@ -38,8 +38,8 @@ OTHER = next((e for e in ENGINES if e != ENGINE and importlib.util.find_spec(e))
 
 
 def test_pair_list_renders_and_differentiates_like_the_kernel() -> None:
-    inputs, intrinsics = room_scene(300, 40, 30)
-    inputs = [x.requires_grad_() for x in inputs]
+    scene, intrinsics = room_scene(300, 40, 30)
+    inputs = [x.requires_grad_() for x in scene]
     view = rasterize(*inputs, intrinsics, (40, 30))
     ours, theirs = (view.image, view.depth, view.alpha), rasterize_pairs(*inputs, intrinsics, (40, 30))
     for a, b in zip(ours, theirs):
