@@ -1,5 +1,7 @@
 """Fused comparisons of views: value and all gradients are those of rendering and torch."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -43,10 +45,6 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     return 0.3 * torch.randn(shape, generator=generator) - 1, depth
 
 
-def intensity(view: reference.Rasterization) -> torch.Tensor:
-    return view.image[..., 0] + (1 - view.alpha) * BACKGROUND
-
-
 def assert_same(ours: list[torch.Tensor], theirs: list[torch.Tensor], tolerance: float) -> None:
     names = ("loss", "means", "quats", "scales", "opacities", "colors", "poses")
     for name, a, b in zip(names, ours, theirs, strict=True):
@@ -57,17 +55,24 @@ def with_gradients(loss: torch.Tensor, inputs: list[torch.Tensor]) -> list[torch
     return [loss.detach(), *torch.autograd.grad(loss, inputs)]
 
 
-def change_twin(render, inputs: list[torch.Tensor], measured: torch.Tensor, scale: float) -> torch.Tensor:
+Renderer = Callable[..., reference.Rasterization]
+
+
+def change_twin(
+    render: Renderer, inputs: list[torch.Tensor], measured: torch.Tensor, scale: float
+) -> torch.Tensor:
     *gaussians, poses = inputs
-    start, end = (intensity(render(*gaussians, pose, INTRINSICS, SIZE)) + EPSILON for pose in poses)
-    return scale * (torch.log(end / start) - measured).square().sum()
+    start, end = (render(*gaussians, pose, INTRINSICS, SIZE) for pose in poses)
+    return scale * reference.compare_change(start, end, measured, BACKGROUND, EPSILON)
 
 
-def view_twin(render, inputs: list[torch.Tensor], target: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+def view_twin(
+    render: Renderer, inputs: list[torch.Tensor], target: torch.Tensor, depth: torch.Tensor
+) -> torch.Tensor:
     *gaussians, poses = inputs
     view = render(*gaussians, poses[0], INTRINSICS, SIZE)
-    error = (view.depth - view.alpha * depth).abs()[depth > 0].sum()
-    return 0.7 * (torch.log(intensity(view) + EPSILON) - target).square().sum() + 0.2 * error
+    squares, errors = reference.compare_view(view, target, depth, BACKGROUND, EPSILON)
+    return 0.7 * squares + 0.2 * errors
 
 
 def change(inputs: list[torch.Tensor], measured: torch.Tensor, scale: float, **options: int) -> torch.Tensor:
