@@ -2,7 +2,7 @@
 
 They are written for reading, and tests compare the kernels with them. What is in torch is differentiable by
 autograd, which is the oracle for the hand-written backward passes. Kernels for a CPU and for a GPU have one
-twin, as they compute the same.
+twin, as they compute the same. The twins of kernels.texture are in kernels/reference_texture.py.
 """
 
 from collections.abc import Sequence
