@@ -8,7 +8,6 @@ The public names load on demand: `import edslam_ti` loads neither torch nor Taic
 """
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,13 +17,6 @@ if TYPE_CHECKING:
     from edslam_ti.pipeline import run
     from edslam_ti.results.maps import load_map
     from edslam_ti.slam import Slam
-
-# A spinning OpenMP/OpenBLAS team after a torch or numpy call steals a core from the Taichi workers.
-# These are read once, when the libraries load, so they are set before anything imports them.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "0")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
 
 __version__ = "0.1.0"
 

@@ -49,13 +49,13 @@ ORDERS: dict[str, list[str]] = {
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
-        *("kernel_times", "steps", "command"),
+        *("kernel_times", "steps", "benchmark", "command"),
     ],
 }
 
 # Libraries that only some modules may import, besides numpy, torch and the standard library.
 LIBRARIES: dict[str, list[str]] = {
-    "taichi": ["kernels", "experiments.kernel_times"],
+    "taichi": ["kernels.engine", "kernels.taichi_speedups"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
     "pydantic": ["config", "arguments", "command_line", "simulation", "datasets"],
@@ -73,7 +73,7 @@ LIBRARIES: dict[str, list[str]] = {
     "lpips": ["evaluation"],
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
-    "matplotlib": ["results", "experiments.steps"],
+    "matplotlib": ["results"],
     "rich": ["datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
 }

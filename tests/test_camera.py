@@ -1,5 +1,7 @@
 """The pinhole camera, with pixel centres at integer coordinates."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -90,7 +92,7 @@ def test_odd_edges_are_cut_off() -> None:
     ],
 )
 def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
-    values = {"width": 12, "height": 8, "fx": 10.0, "fy": 11.0, "cx": 5.0, "cy": 4.0}
+    values: dict[str, Any] = {"width": 12, "height": 8, "fx": 10.0, "fy": 11.0, "cx": 5.0, "cy": 4.0}
     with pytest.raises(DataError, match="camera: expected"):
         Camera(**{**values, **change})
 

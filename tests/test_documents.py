@@ -304,7 +304,10 @@ def test_recipe_for_a_data_set(
             intrinsics=camera.intrinsics,
             depth_times=[sample.timestamp for sample in tiny_samples],
             depth=np.array([sample.depth for sample in tiny_samples]),
-            **{name: array for name, array in zip("xytp", (events.x, events.y, events.t, events.polarity))},
+            x=events.x,
+            y=events.y,
+            t=events.t,
+            p=events.polarity,
         )
         sequence = open_sequence(Config(scene="mine", data_dir=tmp_path))  # recognised
         assert (sequence.dataset, sequence.scene) == ("npz", "mine")

@@ -52,6 +52,7 @@ def test_own_depth_and_events(tmp_path: Path) -> None:
 def test_a_map_is_rendered_from_a_new_pose(result: Path, tmp_path: Path) -> None:
     intensity = example(3)(result, tmp_path / "view.png")
     picture = cv2.imread(str(tmp_path / "view.png"), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
     assert picture.shape == intensity.shape == (400, 640)
     assert np.abs(picture / 255 - intensity.clip(0, 1)).max() < 0.003  # half a grey level
     assert intensity.std() > 0.05  # discs and bars, not one grey

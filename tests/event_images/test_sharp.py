@@ -30,7 +30,9 @@ def frames_of(sequence: EventDepthSequence) -> list[Frame]:
 
 def test_brightness_over_its_mean_during_the_exposure() -> None:
     # Two pixels: one doubles after a quarter of the exposure, then halves behind it; the other stays.
-    events = Events(np.int16([0, 0]), np.int16([0, 0]), np.array([1.0, 5.0]), np.int8([1, -1]))
+    events = Events(
+        np.zeros(2, np.int16), np.zeros(2, np.int16), np.array([1.0, 5.0]), np.array([1, -1], np.int8)
+    )
     step = np.log([2.0, 0.5])
     mean = 0.25 * 1 + 0.75 * 2
     for time, brightness in ((0.5, 1), (3.0, 2), (6.0, 1)):
@@ -39,7 +41,7 @@ def test_brightness_over_its_mean_during_the_exposure() -> None:
 
 
 def test_without_exposure_the_image_is_brought_to_the_time_of_the_frame() -> None:
-    events = Events(np.int16([0]), np.int16([0]), np.array([1.0]), np.int8([1]))
+    events = Events(np.zeros(1, np.int16), np.zeros(1, np.int16), np.array([1.0]), np.ones(1, np.int8))
     for taken, time, expected in ((0.5, 1.5, 0.1), (1.5, 0.5, -0.1), (0.2, 0.5, 0.0)):
         part = events.between(min(taken, time), max(taken, time))
         change = change_from_mean(part, np.full(len(part), 0.1), (taken, taken), time, (1, 1))

@@ -124,7 +124,7 @@ def test_gaussians_at_assumed_depth_can_be_left_out() -> None:
     gaussians = GaussianMap(CONFIG)
     add(gaussians, 3)
     assert gaussians.measured() is gaussians
-    tables = [torch.full((2, 3), 7.0), upright(2), torch.full((2, 3), 0.1)]
+    tables = torch.full((2, 3), 7.0), upright(2), torch.full((2, 3), 0.1)
     gaussians.add(*tables, 0.5, torch.full((2, 1), 0.5), 1, torch.tensor([False, True]))
     gaussians.keep(torch.tensor([True, False, True, True, True]))
     gaussians.clone(torch.tensor([2]))  # the assumed one

@@ -74,9 +74,10 @@ def test_camera_that_steps_back_sees_the_wall_farther_away() -> None:
 def test_median_depth_is_that_of_a_surface_even_at_an_outline() -> None:
     both = wall(2.0)
     both.raw["means"].data[:, 0] -= 2.0  # its outline in the middle of the view
-    behind = wall(3.0)
-    both.add(*(getattr(behind.activated(), name).detach() for name in ("means", "quats", "scales")), 0.95,
-             behind.activated().colors.detach())  # fmt: skip
+    behind = wall(3.0).activated()
+    both.add(
+        behind.means.detach(), behind.quats.detach(), behind.scales.detach(), 0.95, behind.colors.detach()
+    )
     T = np.eye(4)
     depth = render_view(both, CAMERA, T, background=0.5).depth
     expected = render(both.activated(), CAMERA, torch.from_numpy(T), 0.5).expected_depth
