@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from edslam_ti.cold_start import load_kernels
 from edslam_ti.errors import EdSlamError
-from edslam_ti.output import atomic_file
 
 if TYPE_CHECKING:
     from edslam_ti.experiments.kernel_times import Row
@@ -151,6 +150,7 @@ def _write(
 ) -> None:
     """Write benchmark.md and benchmark.json into the folder, and scaling.png if there are curves."""
     from edslam_ti.experiments.steps import plot_scaling
+    from edslam_ti.output import atomic_file
 
     content = {
         "machine": machine,
