@@ -24,10 +24,11 @@ EVERY_IMPORT = f"""
 import gc, importlib, os, sys
 import cv2, numpy, torch, {ENGINE}  # what they change themselves is not ours
 from {ENGINE}.lang import expr, impl, kernel_impl
-from {ENGINE}.lang.ast.ast_transformer_utils import ASTTransformerContext
+from {ENGINE}.lang.ast import ast_transformer_utils
+context = getattr(ast_transformer_utils, "ASTTransformerContext", ast_transformer_utils)
 
 def state():
-    internals = [dict(vars(each)) for each in ({ENGINE}, expr, impl, kernel_impl, ASTTransformerContext)]
+    internals = [dict(vars(each)) for each in ({ENGINE}, expr, impl, kernel_impl, context)]
     collector = gc.isenabled(), gc.get_freeze_count(), gc.get_threshold(), list(gc.callbacks)
     return internals, collector, dict(os.environ), sys.stdout, sys.excepthook, torch.get_num_threads()
 
