@@ -28,12 +28,14 @@ from typing import BinaryIO
 
 import numpy as np
 
+from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 
 VERSION = 1  # raise it when the checks change, so that old copies are made again
 DTYPES = {n: np.dtype(d) for n, d in (("x", "<i2"), ("y", "<i2"), ("t", "<f8"), ("polarity", "i1"))}
 BYTES_PER_EVENT = sum(dtype.itemsize for dtype in DTYPES.values())
 DESCRIPTION = "events.json"
+CHECKED_AT_ONCE = 100_000  # events; what is made of them stays in a core's cache
 SPARE_ROOM = 100_000_000  # bytes that a copy leaves free
 
 
@@ -47,35 +49,57 @@ class CopySummary:
     notes: tuple[str, ...] = ()  # sentences for the user
 
 
-class EventArrays:
-    """Sorted events in memory or in a folder, of which slices are mapped."""
+class EventsInMemory:
+    """Sorted events that have been checked."""
 
-    def __init__(self, events: Events | None = None, folder: Path | None = None) -> None:
+    def __init__(self, events: Events) -> None:
         self._events = events
-        # Files stay open: a copy that is removed or replaced meanwhile can still be read.
-        self._files: dict[str, BinaryIO] = {}
-        if folder is not None:
-            self._files = {name: (folder / f"{name}.bin").open("rb") for name in DTYPES}
-
-    def all(self) -> Events:
-        """Return all events; those of a folder are read from disk as they are looked at."""
-        if self._events is not None:
-            return self._events
-        return Events(**{name: _mapped(self._files[name], dtype) for name, dtype in DTYPES.items()})
 
     def between(self, start: float, end: float) -> Events:
-        """Return the events with start <= t < end.
-
-        A folder is mapped afresh for each slice, so that the pages it touched leave the process with it.
-        """
-        events = self.all()
-        first, last = np.searchsorted(events.t, [start, end])
-        return events[int(first) : int(last)]
+        """Return the events with start <= t < end (views)."""
+        return self._events.between(start, end)
 
     @property
     def time_range(self) -> tuple[float, float]:
-        t = self.all().t
+        return float(self._events.t[0]), float(self._events.t[-1])
+
+
+class MappedEvents:
+    """The sorted events of a copy. Slices are mapped: what they show is read when it is looked at."""
+
+    def __init__(self, folder: Path, size: tuple[int, int]) -> None:
+        self._folder = folder
+        self._size = size
+        # Files stay open: a copy that is removed or replaced meanwhile can still be read.
+        self._files = {name: (folder / f"{name}.bin").open("rb") for name in DTYPES}
+
+    def between(self, start: float, end: float) -> Events:
+        """Return the events with start <= t < end, read-only.
+
+        The copy is mapped afresh for each slice, so that the pages it touched leave the process with it.
+        """
+        events = self._all().between(start, end)
+        for piece in events.pieces(CHECKED_AT_ONCE):
+            self._check(piece)
+        return events
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        t = self._all().t
         return float(t[0]), float(t[-1])
+
+    def _all(self) -> Events:
+        return Events(**{name: _mapped(self._files[name], dtype) for name, dtype in DTYPES.items()})
+
+    def _check(self, events: Events) -> None:
+        """Refuse numbers that a damaged disk has put there: kernels would write outside their images."""
+        width, height = self._size
+        # As unsigned numbers negative ones are large; -1 and 1 are 0 and 2 when one is added.
+        is_inside = events.x.view(np.uint16).max() < width and events.y.view(np.uint16).max() < height
+        sign = (events.polarity + np.int8(1)).view(np.uint8)
+        is_sign = sign.max() <= 2 and not (sign & 1).any()
+        if not (is_inside and is_sign and (events.t[1:] >= events.t[:-1]).all()):
+            raise DataError(f"{self._folder}: damaged; remove it, and it is made again")
 
 
 def _mapped(file: BinaryIO, dtype: np.dtype) -> np.ndarray:

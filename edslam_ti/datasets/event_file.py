@@ -10,7 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from edslam_ti.datasets.event_checks import BadRows, EventChecker, recognised_columns, sorted_by_time
-from edslam_ti.datasets.event_copy import BYTES_PER_EVENT, CopySummary, EventArrays, EventCopy
+from edslam_ti.datasets.event_copy import (
+    BYTES_PER_EVENT,
+    CopySummary,
+    EventCopy,
+    EventsInMemory,
+    MappedEvents,
+)
 from edslam_ti.datasets.event_rows import BLOCK, NpyRows
 from edslam_ti.datasets.event_text import TextRows
 from edslam_ti.datasets.files import cache_folder
@@ -122,14 +128,14 @@ class CheckedRows:
 
 def _checked(
     source: NpyRows | TextRows, size: tuple[int, int], progress: Progress | None
-) -> tuple[EventArrays | CheckedRows, CopySummary]:
+) -> tuple[EventsInMemory | MappedEvents | CheckedRows, CopySummary]:
     """Return a file's good events: from its copy, which is made where there is none, or without one."""
     is_small = isinstance(source, NpyRows) and len(source) <= IN_MEMORY
     stored = EventCopy(cache_folder() / "events", source.path, size, source.columns)
     if not is_small:
         summary = stored.read()
         if summary is not None:
-            return EventArrays(folder=stored.folder), summary
+            return MappedEvents(stored.folder, size), summary
     columns = recognised_columns(source, size)
     checker = EventChecker(source, size, columns)
 
@@ -154,12 +160,12 @@ def _checked(
             try:
                 if stored.has_room(most):
                     summary = stored.write(shown(update), summarised)
-                    return EventArrays(folder=stored.folder), summary
+                    return MappedEvents(stored.folder, size), summary
                 reason = f"expected room for {most * BYTES_PER_EVENT / 1e9:.1f} GB"
             except OSError as error:
                 reason = str(error.strerror or error)
             logger.warning(
-                "%s: no copy of its events in %s (%s); they are read more slowly",
+                "%s: no copy of its events in %s (%s); they are checked anew each time",
                 *(source.path, stored.folder.parent, reason),
             )
             checker = EventChecker(source, size, columns)
@@ -167,7 +173,7 @@ def _checked(
                 rows = CheckedRows(source, checker, update)
                 return rows, summarised(rows.num_events)
         events = Events.concatenate(list(shown(update)))
-    return EventArrays(events), summarised(len(events))
+    return EventsInMemory(events), summarised(len(events))
 
 
 def _bad_rows_note(bad: BadRows, num_rows: int, counted: str) -> list[str]:

@@ -100,6 +100,22 @@ def test_a_damaged_copy_is_made_again(tmp_path: Path, cache: Path, damage: str) 
     assert (folder / "t.bin").stat().st_size == 8 * 3000
 
 
+@pytest.mark.usefixtures("copied")
+@pytest.mark.parametrize(
+    ("name", "byte"), [("x", 255), ("y", 200), ("polarity", 126), ("polarity", 0), ("t", 255)]
+)
+def test_numbers_that_a_damaged_disk_made_are_refused(
+    tmp_path: Path, cache: Path, name: str, byte: int
+) -> None:
+    events = opened(saved(tmp_path, some_events()))
+    [folder] = cache.iterdir()
+    with (folder / f"{name}.bin").open("r+b") as file:
+        file.seek(1000 * event_copy.DTYPES[name].itemsize)
+        file.write(bytes([byte]) * event_copy.DTYPES[name].itemsize)
+    with pytest.raises(DataError, match="damaged; remove it"):
+        events.between(0, 1)
+
+
 KILLED = """
 import os, sys
 from pathlib import Path
@@ -157,7 +173,7 @@ def test_without_a_copy_events_are_the_same(
         monkeypatch.setattr("edslam_ti.datasets.event_copy.os.fsync", full)
     caplog.clear()
     events = opened(path, is_text=is_text)
-    assert "they are read more slowly" in caplog.records[0].message
+    assert "they are checked anew each time" in caplog.records[0].message
     assert (len(events), events.num_dropped) == (len(expected), expected.num_dropped) == (19_999, 1)
     assert events.time_range == expected.time_range
     for k in range(10):
