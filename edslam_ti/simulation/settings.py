@@ -1,12 +1,14 @@
 """Settings of a simulated recording."""
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, ValidationError
 
-from edslam_ti.camera import Camera
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError
+
+if TYPE_CHECKING:  # it loads numpy, which options need not wait for
+    from edslam_ti.camera import Camera
 
 
 class SimulationConfig(Stage):
@@ -70,7 +72,9 @@ class SimulationConfig(Stage):
             raise ConfigError(f"{name}: {problem['msg']}, got {problem['input']!r}") from error
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> "Camera":
         """The pinhole camera, principal point in the middle of the image."""
+        from edslam_ti.camera import Camera
+
         f = self.focal_length or 0.5 * self.width
         return Camera(self.width, self.height, f, f, (self.width - 1) / 2, (self.height - 1) / 2)

@@ -21,8 +21,8 @@ import numpy as np
 from edslam_ti.alignment import MIN_PIXELS
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
+from edslam_ti.event_images.change import BrightnessChange
 from edslam_ti.event_images.contrast import ContrastThreshold
-from edslam_ti.event_images.solve import BrightnessChange
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.patch_warp import NormalEquations
@@ -98,7 +98,7 @@ class BrightnessTracker:
             self._rate.add(len(frame.events))
             if self._rate.is_silent:
                 note = self._without_events(path, guess)
-        self._change.add(frame.events)
+        self._change.add(frame.event_counts)
         newest = self._aligner.brightness_frame(len(trajectory), frame, self._change.log_brightness())
         self._recent = [*self._recent, newest][-self._settings.window :]
         state = self._state

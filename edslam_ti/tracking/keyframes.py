@@ -14,8 +14,9 @@ from torch import Tensor
 from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, linearised, residual_model
 from edslam_ti.camera import Camera
 from edslam_ti.config import TrackingConfig
+from edslam_ti.depth_images import downscaled, downscaled_depth
 from edslam_ti.event_images.solve import Observation, compile_kernels, solve_log_brightness_image
-from edslam_ti.frame import Frame, downscaled, downscaled_depth
+from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse, orthonormalized, se3_exp
 from edslam_ti.kernels import depth_average
 from edslam_ti.kernels.depth_average import DepthAgreement, PixelRays, average_depth

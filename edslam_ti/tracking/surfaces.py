@@ -8,7 +8,8 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig
-from edslam_ti.frame import Frame, downscaled, downscaled_depth
+from edslam_ti.depth_images import downscaled, downscaled_depth
+from edslam_ti.frame import Frame
 from edslam_ti.kernels.time_surface import time_surface, update_last_timestamps
 
 

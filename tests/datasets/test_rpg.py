@@ -62,10 +62,10 @@ def test_an_image_of_events_is_undistorted_as_an_image(folder: Path) -> None:
     raw = np.zeros((HEIGHT, WIDTH), np.float32)
     np.add.at(raw, (rows[:, 2].astype(int), rows[:, 1].astype(int)), 1)
     K = sequence.camera.matrix
-    maps = cv2.initUndistortRectifyMap(
+    columns, lines = cv2.initUndistortRectifyMap(
         K, np.array([-0.2, 0.05, 0, 0, 0]), np.eye(3), K, (WIDTH, HEIGHT), cv2.CV_32FC1
     )
-    expected = cv2.remap(raw, *(np.rint(m) for m in maps), cv2.INTER_NEAREST)
+    expected = cv2.remap(raw, np.rint(columns), np.rint(lines), cv2.INTER_NEAREST)
     events = sequence.events(0, 1)
     count = np.zeros((HEIGHT, WIDTH), np.float32)
     np.add.at(count, (events.y, events.x), 1)

@@ -18,8 +18,6 @@ from sequences import (
 
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
-from edslam_ti.event_images.solve import HYSTERESIS, BrightnessChange
-from edslam_ti.events import Events
 from edslam_ti.slam import Slam
 
 GAP = range(16, 22)  # frames, a quarter of a second
@@ -45,17 +43,6 @@ def messages(slam: Slam) -> str:
 
 def lost(slam: Slam) -> list[int]:
     return [k for k, result in enumerate(slam.results) if not result.converged]
-
-
-def test_change_is_the_sum_of_thresholds_and_half_a_one_towards_the_last() -> None:
-    change = BrightnessChange((2, 3), 0.2, 0.3)
-    x, y = np.array([0, 0, 2, 0], np.int16), np.array([0, 0, 1, 0], np.int16)
-    change.add(Events(x, y, np.arange(4.0), np.array([1, 1, -1, -1], np.int8)))
-    expected = np.zeros((2, 3))
-    expected[0, 0], expected[1, 2] = 0.2 * 2 - 0.3 * (1 + HYSTERESIS), -0.3 * (1 + HYSTERESIS)
-    np.testing.assert_allclose(change.log_brightness(), expected, atol=1e-6)
-    change.reset()
-    assert (change.log_brightness() == 0).all()
 
 
 def test_brightness_images_are_better_than_time_surfaces_between_depth_images(
