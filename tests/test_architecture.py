@@ -49,7 +49,7 @@ ORDERS: dict[str, list[str]] = {
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
-        *("kernel_times", "steps", "benchmark", "command"),
+        *("kernel_times", "front_end", "steps", "benchmark", "command"),
     ],
 }
 

@@ -69,6 +69,7 @@ class RpgSequence(EventDepthSequence):
         self._metres_per_unit = stated.metres_per_unit if scale_is_given else 1 / TUM_DEPTH_SCALE
 
         self._events = EventFile(folder / "events.txt", width, height, is_text=True)
+        self.num_dropped_events = self._events.num_dropped
         first, _ = self._events.time_range
         self.time_offset = first if abs(first) > LATEST_START else 0.0
         if self.time_offset:

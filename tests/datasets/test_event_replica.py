@@ -158,6 +158,15 @@ def test_polarity_zero_means_negative_where_the_file_says_so_throughout(tmp_path
         EventFile(tmp_path / "e.npy", WIDTH, HEIGHT)
 
 
+def test_a_bad_row_is_left_out_of_a_sequence_and_counted(tmp_path: Path) -> None:
+    events = some_events()
+    events[1700, 1] = 33014
+    folder = write_sequence(tmp_path / "s", events)
+    read_all(folder)
+    sequence = EventReplicaSequence(folder)
+    assert (len(sequence.events(-1, 1)), sequence.num_dropped_events) == (2999, 1)
+
+
 def test_large_absolute_stamps_are_shifted_together(tmp_path: Path) -> None:
     zero = 1_600_000_000
     events = some_events()
