@@ -19,6 +19,9 @@ WINDOW = 8  # blocks, about a million rows, in which more than that share is ref
 NEIGHBOURS = 16  # events on either side that tell whether a stamp is out of place
 ORDERS = ("xytp", "txyp", "xypt")  # of columns, as programs write them
 ENOUGH_TO_TELL = 100  # rows, for an order that is not the expected one
+# A few stamps at either end of a recording are of another time (left over from before, or a broken last
+# row) where so long a gap, in seconds and in lengths of the recording, divides them from the rest.
+OTHER_TIME, OTHER_TIME_LENGTHS = 60.0, 10.0
 AT_ONCE = 65_536  # stamps whose neighbours are compared at once
 
 
@@ -209,7 +212,7 @@ class EventChecker:
             return None
         newest = np.maximum(np.maximum.accumulate(stamps), self._newest)
         if (newest - stamps).max() <= DISORDER:
-            return None
+            return self._at_ends(t, good, is_end=following is None)
         stamps = np.concatenate([self._recent, stamps])
         is_wrong = _is_out_of_order(stamps, np.ones(len(stamps), bool))
         is_wrong &= np.abs(stamps - _running_median(stamps)) > DISORDER
@@ -218,6 +221,28 @@ class EventChecker:
         first = len(self._recent)
         result = np.zeros(len(t), bool)
         result[good] = is_wrong[first : len(stamps) - len(after)]
+        return result
+
+    def _at_ends(self, t: np.ndarray, good: np.ndarray, is_end: bool) -> np.ndarray | None:  # [N] bool
+        """Return which stamps of a block in order are of another time than the recording, None for none."""
+        index = np.flatnonzero(good)
+        first, last = 0, len(index)
+        if np.isnan(self._oldest):
+            for k in range(1, min(NEIGHBOURS + 1, len(index))):
+                gap = t[index[k]] - t[index[k - 1]]
+                if gap > max(OTHER_TIME, OTHER_TIME_LENGTHS * (t[index[-1]] - t[index[k]])):
+                    first = k
+        begin = t[index[first]] if np.isnan(self._oldest) and first < last else self._oldest
+        if is_end:
+            for k in range(max(first + 1, len(index) - NEIGHBOURS), len(index)):
+                gap = t[index[k]] - t[index[k - 1]]
+                if gap > max(OTHER_TIME, OTHER_TIME_LENGTHS * (t[index[k - 1]] - begin)):
+                    last = k
+                    break
+        if (first, last) == (0, len(index)):
+            return None
+        result = np.zeros(len(t), bool)
+        result[index[:first]] = result[index[last:]] = True
         return result
 
     def _count_bad(self, block: RowBlock, good: np.ndarray, checks: list[np.ndarray]) -> None:

@@ -265,6 +265,26 @@ def test_stale_first_stamps_are_left_out(tmp_path: Path) -> None:
     assert_same(opened(saved(tmp_path, rows)).between(-np.inf, np.inf), rows[5:])
 
 
+@pytest.mark.usefixtures("copied")
+@pytest.mark.parametrize("row", [0, 4, -1, -5])
+@pytest.mark.parametrize("time", [-3600.0, 3600.0, 1.6e9])
+def test_a_few_stamps_of_another_time_at_the_ends_are_left_out(tmp_path: Path, row: int, time: float) -> None:
+    rows = some_events()
+    ends = slice(0, row + 1) if row >= 0 else slice(row, None)
+    rows[ends, 2] = time
+    events = opened(saved(tmp_path, rows))
+    kept = np.delete(rows, ends, 0)
+    assert_same(events.between(-np.inf, np.inf), kept)
+    assert events.num_dropped == 3000 - len(kept)
+    assert "expected stamps in order" in events.notes[0]
+
+
+def test_a_quiet_beginning_is_no_other_time(tmp_path: Path) -> None:
+    rows = some_events(end=10.0)
+    rows[3:, 2] += 90
+    assert_same(opened(saved(tmp_path, rows)).between(-np.inf, np.inf), rows)
+
+
 def test_more_than_a_share_is_refused(tmp_path: Path) -> None:
     rows = some_events()
     rows[:30, 0] = -1  # one percent
