@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edslam_ti.errors import DataError, plain
+from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 
 LARGEST = 1e20  # nanoseconds since 1970 are 2e18; nothing that is measured is larger
 LARGEST_FILE = 2_000_000_000  # bytes of text
@@ -53,7 +53,7 @@ def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
     `expected` says in a message what the file is for.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; {expected}")
+        raise FileNotFoundError(plain(f"{path} not found; {expected}", LONGEST_MESSAGE))
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise DataError(f"{path}: {expected}, got {path.stat().st_size} bytes; is this the right file?")
