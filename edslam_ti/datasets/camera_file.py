@@ -7,7 +7,6 @@ of these misspelt.
 
 import difflib
 import json
-import reprlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from edslam_ti.camera import LARGEST_SIDE, Camera
 from edslam_ti.datasets.depth import DepthFormat
 from edslam_ti.datasets.files import file_bytes
-from edslam_ti.errors import DataError, plain
+from edslam_ti.errors import DataError, plain, shown
 
 DISTORTION_KEYS = ("distortion", "distortion_coefficients", "dist", "k1", "k2", "k3", "p1", "p2")
 LONGEST_KEY = 40  # characters of a key that may be one of ours, misspelt
@@ -112,11 +111,6 @@ def read_json(path: Path) -> Any:
         raise DataError(f"{path}: calibration not readable as JSON: nested too deeply") from error
     except ValueError as error:  # JSONDecodeError, repeated keys, integers of thousands of digits
         raise DataError(f"{path}: calibration not readable as JSON: {plain(error)}") from error
-
-
-def shown(value: object) -> str:
-    """Return a value as Python writes it, shortened: it may be of any size and depth."""
-    return plain(reprlib.repr(value), 80)
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

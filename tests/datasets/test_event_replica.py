@@ -406,3 +406,27 @@ def test_bad_data_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
         read_all(folder)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) <= 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("x" * 1_000_000, "x" * 196 + " ..."),
+        ("\x1b]0;title\x07", r"\x1b]0;title\x07"),
+        ("a\nb: c\r\n", r"a\nb: c\r\n"),
+        ("a\0b", r"a\x00b"),
+        ("\ud800", r"\ud800"),
+        ("[/nope] [bold]x", "[/nope] [bold]x"),
+        ("Büro, 2.5 m", "Büro, 2.5 m"),
+    ],
+)
+def test_a_description_is_one_short_line_of_text(tmp_path: Path, text: str, shown: str) -> None:
+    folder = write_sequence(tmp_path / "s", camera=CAMERA | {"description": text})
+    assert EventReplicaSequence(folder).description == shown
+
+
+def test_camera_json_may_begin_with_a_mark_and_hold_other_programs_keys(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "s")
+    values = CAMERA | {"k1": 0.0, "distortion": [0, 0], "serial": "x" * 100_000, "nested": {"a": [1]}}
+    (folder / "camera.json").write_text("\ufeff" + json.dumps(values), encoding="utf-8")
+    assert EventReplicaSequence(folder).camera.fx == 30
