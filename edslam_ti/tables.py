@@ -36,9 +36,9 @@ def read_table(path: Path, columns: int, line: str) -> Table:
     for number, text in text_lines(path, f"expected lines '{line}'"):
         fields = text.split()
         where = f"{path}: line {number}: expected {columns} numbers a line '{line}'"
+        if "," in text:
+            raise DataError(f"{where} with blanks between them, got commas: '{plain(text, 60)}'")
         if len(fields) != columns:
-            if len(text.split(",")) == columns:
-                raise DataError(f"{where} with blanks between them, got commas: '{plain(text, 60)}'")
             raise DataError(f"{where}, got {len(fields)}: '{plain(text, 60)}'")
         rows.append([_number(field, where) for field in fields])
         lines.append(number)

@@ -15,6 +15,7 @@ from edslam_ti.errors import DataError
 
 LATEST_START = 1000.0  # s; the microseconds end at 2147 s
 OTHER_UNIT = 300  # times as long or short: milliseconds taken for seconds, and worse
+UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 LITTLE = 0.5  # of the events' time
 VERY_LITTLE = 0.15  # indices of 100 images a second, taken for milliseconds, span a tenth of their time
 FASTEST_DEPTH = 100.0  # Hz; depth cameras make up to 90 images a second
@@ -43,16 +44,17 @@ def check_clock(
     too_long = length > duration * OTHER_UNIT and inside < 2
     if covers and not too_short and not too_long:
         return
-    apart = [stamp + sequence.time_offset for stamp in (stamps[0], stamps[-1], first, last)]
+    own = np.array([stamps[0], stamps[-1]]) + sequence.time_offset
+    events = np.array([first, last]) + sequence.time_offset
     hint = ""
-    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
-        if 0.2 < length / duration / factor < 5:
+    for unit, factor in UNITS.items():
+        if np.abs(own / factor - events).max() < 0.5 * duration:
             hint = f"; {name} looks as if it were in {unit}"
-        if length > 0 and 0.2 < duration / length / factor < 5:
+        if np.abs(events / factor - own).max() < 0.5 * length:
             hint = f"; the events look as if they were in {unit}"
     raise DataError(
-        f"{folder}: the clocks differ: {name} covers {apart[0]:.12g} to {apart[1]:.12g} s, events "
-        f"{apart[2]:.12g} to {apart[3]:.12g} s{hint}; expected the same clock, in seconds"
+        f"{folder}: the clocks differ: {name} covers {own[0]:.12g} to {own[1]:.12g} s, events "
+        f"{events[0]:.12g} to {events[1]:.12g} s{hint}; expected the same clock, in seconds"
     )
 
 

@@ -149,6 +149,7 @@ class Stamped(EventReplicaSequence):
         (lambda t: t * 1e6, r"poses_ts\.txt covers 0 to 300000 s.*looks as if it were in microseconds"),
         (lambda t: t + EPOCH, r"poses_ts\.txt covers 1642650000 to 1642650000\.3 s, events 5\.7.* to 0\.29"),
         (lambda t: t + 100, r"the clocks differ: poses_ts\.txt covers 100 to 100\.3 s"),
+        (lambda t: t / 1e3, r"the clocks differ: poses_ts.* events look as if they were in milli"),
         (lambda t: EPOCH * 1e9 + t * 1e9, r"the clocks differ: poses_ts\.txt covers 1\.64265e\+18"),
     ],
 )
@@ -181,3 +182,15 @@ def test_truth_out_of_order_is_sorted_and_noted(tmp_path: Path) -> None:
     assert (sequence.truth.timestamps == expected.timestamps).all()
     assert (sequence.truth.poses == expected.poses).all()
     assert ["rows repeat a time" in n or "not in the order" in n for n in sequence.notes] == [True, True]
+
+
+def test_a_stale_first_event_is_no_other_unit(tmp_path: Path) -> None:
+    events = some_events()
+    events[1:, 2] += 200.0
+    folder = write_sequence(tmp_path / "s", events)
+    for name in ("depth", "images"):
+        renamed(folder, name, {ms: 200_000 + ms for ms in range(0, 301, 50)})
+    with pytest.raises(DataError, match=r"covers 200 to 200\.3 s, events 5\.7.* to 200\.2") as caught:
+        EventReplicaSequence(folder)
+    assert "looks as if" not in str(caught.value)
+    assert "look as if" not in str(caught.value)
