@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from edslam_ti.errors import DataError
+from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 from edslam_ti.geometry import interpolate, rotation_angle_deg
 from edslam_ti.output import atomic_file
 from edslam_ti.tables import read_table
@@ -166,6 +166,8 @@ def read_tum(path: Path, notes: list[str] | None = None) -> Trajectory:
     What `in_order` mends is appended to `notes`, a line each; without such a list it goes to the log.
     Raises `FileNotFoundError` or `DataError`.
     """
+    if not path.is_file():
+        raise FileNotFoundError(plain(f"{path} not found", LONGEST_MESSAGE))
     table = read_table(path, 8, "t tx ty tz qx qy qz qw")
     rows, lines = table.rows, table.lines
     norms = np.linalg.norm(rows[:, 4:], axis=1)
