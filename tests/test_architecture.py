@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 # not import each other, but for those in the order of ORDERS.
 RANKS: list[list[str]] = [
     ["kernels", "errors", "memory", "output", "open3d_loader", "cold_start"],
-    ["config", "arguments", "geometry", "camera", "events"],
+    ["config", "arguments", "geometry", "camera", "events", "tables"],
     ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
@@ -30,7 +30,7 @@ RANKS: list[list[str]] = [
 ORDERS: dict[str, list[str]] = {
     "ranks": [
         *("errors", "memory", "output", "open3d_loader", "kernels", "cold_start"),
-        *("config", "arguments", "geometry", "camera", "events"),
+        *("config", "arguments", "geometry", "camera", "events", "tables"),
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],

@@ -366,16 +366,30 @@ def test_true_poses_without_truth_are_an_error(recording: Path, tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
-def test_depth_that_is_all_zero_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
+def test_depth_that_is_all_zero_is_refused_before_the_first_frame(recording: Path, tmp_path: Path) -> None:
     for path in (recording / "depth").iterdir():
         cv2.imwrite(str(path), np.zeros((80, 120), np.uint16))
+    with pytest.raises(DataError, match="depth has no variation: every pixel is missing"):
+        quiet_run(config_for(recording, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_depth_of_two_pixels_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
+    depth = np.zeros((80, 120), np.uint16)
+    depth[0, :2] = 5000, 9000
+    for path in (recording / "depth").iterdir():
+        cv2.imwrite(str(path), depth)
     folder = quiet_run(config_for(recording, tmp_path))
+    assert len(read_tum(folder / "trajectory_tum.txt")) == 14
+    assert metrics_of(folder)["num_lost_frames"] == 13  # nothing to align to
+
+
+def test_a_map_that_is_empty_is_said_to_be(tiny_folder: Path, tmp_path: Path) -> None:
+    nothing_stays = {"initial_opacity": 0.1, "min_opacity": 0.99}
+    folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.3, mapping=nothing_stays))
     assert not (folder / "map.ply").exists()
     assert "the map is empty" in (folder / "log.txt").read_text()
-    assert len(read_tum(folder / "trajectory_tum.txt")) == 14
-    metrics = metrics_of(folder)
-    assert metrics["num_lost_frames"] == 13  # nothing to align to
-    assert metrics["depth_l1_cm"] is None
+    assert metrics_of(folder)["depth_l1_cm"] is None
 
 
 def test_map_without_a_surface_keeps_its_other_results(tiny_folder: Path, tmp_path: Path) -> None:
