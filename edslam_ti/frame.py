@@ -10,6 +10,8 @@ from edslam_ti.datasets.base import Sample
 from edslam_ti.events import Events
 from edslam_ti.kernels.time_surface import count_events
 
+EVENTS_AT_ONCE = 1_000_000  # whose pixels are held in memory
+
 
 class EventCounts:
     """Events pixel by pixel; arrays are shared, do not change them."""
@@ -23,9 +25,10 @@ class EventCounts:
     @functools.cached_property
     def first(self) -> np.ndarray:  # [H, W] int8
         """Polarity of the first event, 0 where there was none."""
-        first, events = np.zeros_like(self.last), self._events
-        pixel = events.y.astype(np.int64) * first.shape[1] + events.x
-        first.ravel()[pixel[::-1]] = events.polarity[::-1]  # of repeated pixels the last one stays
+        first = np.zeros_like(self.last)
+        for events in reversed(list(self._events.pieces(EVENTS_AT_ONCE))):
+            pixel = events.y.astype(np.int64) * first.shape[1] + events.x
+            first.ravel()[pixel[::-1]] = events.polarity[::-1]  # of repeated pixels the last one stays
         return first
 
 

@@ -34,7 +34,7 @@ ORDERS: dict[str, list[str]] = {
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
-    "event_images": ["change", "solve", "contrast", "sharp"],
+    "event_images": ["change", "noisy", "solve", "contrast", "sharp"],
     "tracking": [
         *(
             "consistency",
@@ -59,7 +59,7 @@ ORDERS: dict[str, list[str]] = {
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
-        *("kernel_times", "steps", "benchmark", "command"),
+        *("kernel_times", "front_end", "steps", "benchmark", "command"),
     ],
 }
 

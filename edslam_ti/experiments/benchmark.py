@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from edslam_ti.experiments.kernel_times import Row
     from edslam_ti.experiments.steps import Curve
 
-Suite = Literal["time_surface", "tracking", "rasterizer", "mapping_step", "cold_start", "slam", "scaling"]
+Suite = Literal[
+    "time_surface", "front_end", "tracking", "rasterizer", "mapping_step", "cold_start", "slam", "scaling"
+]
 Engine = Literal["taichi", "quadrants"]
 KERNELS: tuple[Suite, ...] = ("time_surface", "tracking", "rasterizer", "mapping_step")
 WHOLE_RUNS = ("cold_start", "slam")  # suites of which every row depends on the engine

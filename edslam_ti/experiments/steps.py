@@ -18,6 +18,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.datasets import SampledSequence, open_sequence
 from edslam_ti.datasets.base import Sample
+from edslam_ti.experiments.front_end import front_end
 from edslam_ti.experiments.kernel_times import (
     OURS,
     Row,
@@ -57,6 +58,8 @@ def rows(
     for size in sizes:
         for count in events if "time_surface" in suites else ():
             yield from surface(size, count, watch)
+        for count in events if "front_end" in suites else ():
+            yield from front_end(size, count, watch)
         if "tracking" in suites:
             yield from tracking(size, watch)
         for count in gaussians:

@@ -171,7 +171,7 @@ class GaussianMapper:
         return {
             "num_keyframes": len(self.keyframes),
             "num_mapping_steps": self.num_steps,
-            "num_hot_pixels": int(self.images.noisy_pixels.sum()),
+            "num_hot_pixels": int(self.images.noisy_pixels.mask.sum()),
         }
 
     def save(self, folder: Path) -> None:

@@ -4,7 +4,7 @@ The start image is that of a window of a few seconds of events. Grey images, whe
 themselves and tell what the start image is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,9 +14,10 @@ from edslam_ti.config import MappingConfig
 from edslam_ti.depth_images import block_means, with_holes_filled
 from edslam_ti.event_images.change import ChangeArchive
 from edslam_ti.event_images.contrast import ContrastThreshold
+from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.event_images.sharp import SharpImage, SharpImages
 from edslam_ti.event_images.solve import EventView, solve_start_image
-from edslam_ti.frame import EventCounts, Frame
+from edslam_ti.frame import Frame
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
@@ -25,8 +26,6 @@ THOROUGH = {4: 100, 2: 80}  # the same at the end
 GIVEN_VIEWS = 6  # frames of earlier windows that a start image is tied to
 DETAIL_SIGMA = 4.0  # px; smaller details of the start image are learned from renders
 DETAIL_RATE = 0.1  # share of a render's difference by which they move
-NOISY = 10.0  # times the median of a pixel's neighbours: it fires by itself
-NOISY_EVENTS = 100  # a pixel with fewer is not called noisy
 
 
 @dataclass
@@ -61,9 +60,7 @@ class EventImages:
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
         self._windows: list[_Window] = []
-        self._num_events = np.zeros(camera.shape, np.float32)
-        # Pixels that fire by themselves; neighbours stand in for them.
-        self.noisy_pixels = np.zeros(camera.shape, bool)
+        self.noisy_pixels = NoisyPixels(camera.shape)
         self._started = -np.inf  # time of the current window's first frame
 
     @property
@@ -83,7 +80,7 @@ class EventImages:
     def add(self, frame: Frame, index: int) -> None:
         """Add a frame's events, and its image unless the frame is held out."""
         self._archive.add(frame.event_counts, index, is_kept=not frame.is_held_out)
-        self._find_noisy_pixels(frame.event_counts)
+        self.noisy_pixels.add(frame.event_counts)
         if not frame.is_held_out:
             self._depths[index] = frame.depth
             self._add_grey(frame, index)
@@ -162,8 +159,8 @@ class EventImages:
     def _add_grey(self, frame: Frame, index: int) -> None:
         grey = None if self._sharp_images is None else self._sharp_images.at(frame)
         if grey is not None:
-            grey.log_brightness[self.noisy_pixels] = cv2.medianBlur(grey.log_brightness, 5)[self.noisy_pixels]
-            self._grey[index] = grey
+            without_noise = self.noisy_pixels.replaced(grey.log_brightness)
+            self._grey[index] = replace(grey, log_brightness=without_noise)
 
     def _tie_to_grey(self, window: _Window, frames: list[int]) -> None:
         """Shift a start image to what the grey images of its frames say, pixel by pixel where they do."""
@@ -189,14 +186,7 @@ class EventImages:
 
     def _change(self, index: int) -> np.ndarray:
         change = np.float32(self._contrast_threshold) * self._archive.change(index)
-        if self.noisy_pixels.any():
-            change[self.noisy_pixels] = cv2.medianBlur(change, 5)[self.noisy_pixels]
-        return change
-
-    def _find_noisy_pixels(self, counts: EventCounts) -> None:
-        self._num_events += counts.numbers.sum(-1)
-        around = cv2.medianBlur(self._num_events, 5)
-        self.noisy_pixels = self._num_events > np.maximum(NOISY * around, NOISY_EVENTS)
+        return self.noisy_pixels.replaced(change)
 
     def _view(self, index: int, trajectory: Trajectory, is_relative: bool) -> EventView:
         change = self._change(index) if is_relative else self.log_brightness(index)

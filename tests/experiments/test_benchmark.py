@@ -14,6 +14,7 @@ import edslam_ti.experiments.steps
 from apps.benchmark import main
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import EdSlamError
+from edslam_ti.experiments.front_end import front_end
 from edslam_ti.experiments.kernel_times import (
     OURS,
     Row,
@@ -178,3 +179,15 @@ def test_missing_device_is_one_line() -> None:
     if not torch.cuda.is_available():
         with pytest.raises(EdSlamError, match="use --device cpu"):
             main(["--device", "cuda"])
+
+
+def test_the_front_end_is_timed_in_a_cache_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr("edslam_ti.experiments.front_end.IN_MEMORY", 10_000)
+    monkeypatch.setattr("edslam_ti.datasets.event_file.IN_MEMORY", 10_000)
+    rows = list(front_end((64, 48), 5_000, Stopwatch(1)))
+    assert [row.task.split(": ")[1] for row in rows] == ["check and copy", "read, count, time surface"]
+    assert all(row.wall_ms > 0 for row in rows)
+    assert not list(tmp_path.iterdir())

@@ -113,7 +113,7 @@ def test_pixels_that_fire_by_themselves_are_found_and_replaced_by_their_neighbou
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     clean, _ = images_of(tiny_sequence, tiny_samples)
-    assert not clean.noisy_pixels.any()
+    assert not clean.noisy_pixels.mask.any()
     noisy = []
     for sample in tiny_samples:
         x, y = np.repeat(np.array([[30, 40], [77, 12]], np.int16), 40, axis=0).T
@@ -121,7 +121,7 @@ def test_pixels_that_fire_by_themselves_are_found_and_replaced_by_their_neighbou
         noise = Events(x.copy(), y.copy(), np.full(len(x), sample.timestamp), ones)
         noisy.append(replace(sample, events=Events.concatenate([sample.events, noise])))
     images, _ = images_of(tiny_sequence, noisy)
-    assert np.argwhere(images.noisy_pixels).tolist() == [[12, 77], [40, 30]]
+    assert np.argwhere(images.noisy_pixels.mask).tolist() == [[12, 77], [40, 30]]
     assert errors(images, tiny_samples).max() < 1.1 * errors(clean, tiny_samples).max() + 0.02
 
 
