@@ -30,6 +30,7 @@ CONTRADICTION = 100.0
 SURE, SMALLEST_DELAY = 4.5, 0.004
 SMALLEST_SCALE = 1e-6  # of squared residuals
 HUBER = 1.5  # standard deviations
+FROZEN_SHARE = 0.2  # of the compared frames with the depth image of the frame before: depth has stopped
 
 
 @dataclass(frozen=True)
@@ -40,18 +41,25 @@ class Consistency:
     disagreement: float  # squared, over what residuals let expect
     depth_delay_s: float  # by which depth images show an earlier time than their stamps
     depth_delay_sigma_s: float
+    repeated_share: float  # of the compared frames with the very depth image of the frame before
 
     @property
     def problems(self) -> list[str]:
         """One line for each fault that is likely, and what to do."""
         lines = []
+        is_contradiction = self.disagreement > CONTRADICTION
+        if is_contradiction and self.repeated_share > FROZEN_SHARE:
+            return [
+                f"{self.repeated_share:.0%} of the depth images repeat the one before although events show "
+                "motion: the depth stream has stopped; its poses cannot be right"
+            ]
         delay, sigma = self.depth_delay_s, self.depth_delay_sigma_s
         if abs(delay) > max(SURE * sigma, SMALLEST_DELAY):
             lines.append(
                 f"depth looks {1000 * abs(delay):.0f} ms (+- {1000 * sigma:.0f}) too "
                 f"{'late' if delay > 0 else 'early'} for the events; check the clocks of both streams"
             )
-        if self.disagreement > CONTRADICTION:
+        if is_contradiction:
             lines.append(
                 f"events and depth contradict each other ({np.sqrt(self.disagreement):.0f} times the "
                 f"expected difference of poses, usual are 3 to 7); check focal length, principal point, "
@@ -68,6 +76,7 @@ class _Comparison:
     keyframe: int
     disagreement: np.ndarray  # [6] d
     information: np.ndarray  # [6, 6] of T_b
+    is_repeated: bool
 
 
 class ConsistencyCheck:
@@ -89,11 +98,12 @@ class ConsistencyCheck:
         T_world_camera: np.ndarray,  # [4, 4] by brightness and depth
         by_brightness: np.ndarray,  # [4, 4] T_world_camera
         system: NormalEquations,  # of the latter
+        is_repeated: bool = False,  # its depth image is that of the frame before
     ) -> None:
         """Add a frame whose pose was measured twice."""
         scale = max(2 * system.cost / max(system.num_surface, 1), SMALLEST_SCALE)
         difference = se3_log(inverse(T_world_camera) @ by_brightness)
-        self._comparisons.append(_Comparison(index, keyframe, difference, system.H / scale))
+        self._comparisons.append(_Comparison(index, keyframe, difference, system.H / scale, is_repeated))
         if len(self._comparisons) > MOST:
             self._comparisons = self._comparisons[1::2]
             self._every *= 2
@@ -111,7 +121,8 @@ class ConsistencyCheck:
             expected.append(root @ change)
             squares.append(float(c.disagreement @ c.information @ c.disagreement) / 6)
         delay, sigma = _robust_slope(np.concatenate(expected), np.concatenate(observed))
-        return Consistency(len(squares), float(np.median(squares)), delay, sigma)
+        repeated = float(np.mean([c.is_repeated for c in self._comparisons]))
+        return Consistency(len(squares), float(np.median(squares)), delay, sigma, repeated)
 
 
 def _velocity(trajectory: Trajectory, index: int) -> np.ndarray:  # [6]

@@ -94,6 +94,7 @@ class BrightnessTracker:
         self._usual_misfit = np.inf  # log brightness; until the first image is aligned, any is usual
         self._smoother = PoseSmoother()
         self._check = ConsistencyCheck()
+        self._last_depth: np.ndarray | None = None  # [H, W] metres, as it came
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame` and corrections of earlier poses."""
@@ -114,7 +115,8 @@ class BrightnessTracker:
             result = best.result
             path.newest = result.T_world_camera
             if result.converged:
-                self._compare(state.keyframe, newest, path)
+                self._compare(state.keyframe, newest, self._is_repeated(frame), path)
+            self._last_depth = frame.depth if frame.depth is not None else self._last_depth
             note = note or self._keep_up(state, newest, result.converged, best.overlap, path)
         else:
             if isinstance(state, Coasting):
@@ -136,13 +138,20 @@ class BrightnessTracker:
         """Return whether events and depth told the same motion; None: too little was compared."""
         return self._check.result(trajectory)
 
-    def _compare(self, keyframe: BrightnessKeyframe, newest: BrightnessFrame, path: PathDraft) -> None:
+    def _is_repeated(self, frame: Frame) -> bool:
+        """Return whether a depth image is that of the frame before, to the last bit."""
+        last = self._last_depth
+        return frame.depth is not None and last is not None and np.array_equal(frame.depth, last)
+
+    def _compare(
+        self, keyframe: BrightnessKeyframe, newest: BrightnessFrame, is_repeated: bool, path: PathDraft
+    ) -> None:
         """Measure the newest pose by brightness alone, too, to see whether depth says the same."""
         if newest.depth is None or newest.index == keyframe.index or not self._check.wants():
             return
         by_brightness = self._aligned_without_depth(keyframe, newest, path)
         if by_brightness is not None:
-            self._check.add(newest.index, keyframe.index, path.newest, *by_brightness)
+            self._check.add(newest.index, keyframe.index, path.newest, *by_brightness, is_repeated)
 
     # --- without events ---
 
