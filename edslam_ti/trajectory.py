@@ -50,6 +50,10 @@ class Trajectory:
         """Return key pose `index`; negative counts from the end."""
         return self._poses[index]
 
+    def index_of(self, timestamp: float) -> int:
+        """Return the index of the last pose at or before a time; -1: there is none."""
+        return bisect.bisect_right(self._timestamps, timestamp) - 1
+
     def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
         """Add a pose later than all others."""
         if self._timestamps and timestamp <= self._timestamps[-1]:

@@ -36,7 +36,17 @@ ORDERS: dict[str, list[str]] = {
     ],
     "event_images": ["change", "noisy", "solve", "contrast", "sharp"],
     "tracking": [
-        *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "smoothing", "gaps"),
+        *(
+            "consistency",
+            "tracker",
+            "uncertainty",
+            "surfaces",
+            "patch_tracker",
+            "keyframes",
+            "motion_prior",
+            "smoothing",
+            "gaps",
+        ),
         *("place_recognition", "pose_graph", "loop_closure", "image_tracker"),
     ],
     "mapping": [
