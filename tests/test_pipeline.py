@@ -109,6 +109,7 @@ def recording(tiny_folder: Path, tmp_path: Path) -> Path:
 # --- what a run leaves behind ---
 
 
+@pytest.mark.slow
 def test_every_artefact_is_there_and_holds_something(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == ARTEFACTS
     assert all(path.stat().st_size > 0 for path in result.iterdir())
@@ -254,6 +255,7 @@ def test_slice_of_inceventgs_is_measured_apart(
     assert 10 < theirs["psnr_corrected_db"] != metrics["psnr_corrected_db_all"]
 
 
+@pytest.mark.slow
 def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
     values = yaml.safe_load((result / "config.yaml").read_text())
     again = quiet_run(Config().updated(values | {"out": str(tmp_path)}))
@@ -295,6 +297,7 @@ def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None
     assert metrics["num_gaussians"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("is_mapping", "expected"), [(True, 6), (False, 0)])
 def test_free_memory_is_given_back_after_every_mapped_frame(
     is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -306,6 +309,7 @@ def test_free_memory_is_given_back_after_every_mapped_frame(
     assert len(calls) == expected
 
 
+@pytest.mark.slow
 def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "open3d_rgbd"))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply"}  # it has no Gaussians
@@ -317,12 +321,14 @@ def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_p
     assert metrics["psnr_db"] > 15  # it fuses the images themselves
 
 
+@pytest.mark.slow
 def test_paper_method_runs_by_its_name(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "ed_slam_paper", mapping={"enabled": False}))
     assert folder.parent.name == "ed_slam_paper"
     assert yaml.safe_load((folder / "config.yaml").read_text())["tracking"]["depth_weight"] == 0
 
 
+@pytest.mark.slow
 def test_true_poses_have_no_error(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, poses="truth"))
     metrics = metrics_of(folder)
@@ -344,6 +350,7 @@ def test_lpips_weights_give_a_perceptual_distance(
 # --- data that lacks something ---
 
 
+@pytest.mark.slow
 def test_recording_of_events_and_depth_alone_runs_without_metrics(recording: Path, tmp_path: Path) -> None:
     shutil.rmtree(recording / "images")
     for name in ("poses_ts.txt", "traj.txt"):
@@ -392,6 +399,7 @@ def test_a_map_that_is_empty_is_said_to_be(tiny_folder: Path, tmp_path: Path) ->
     assert metrics_of(folder)["depth_l1_cm"] is None
 
 
+@pytest.mark.slow
 def test_map_without_a_surface_keeps_its_other_results(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.3, mapping={"max_gaussians": 2}))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"mesh.ply"}
@@ -413,6 +421,7 @@ def interrupt_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Slam, "process", processed)
 
 
+@pytest.mark.slow
 def test_interrupt_saves_what_there_is_and_exits_130(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -434,6 +443,7 @@ def test_interrupt_saves_what_there_is_and_exits_130(
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.slow
 def test_interrupt_while_refining_stops_it(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

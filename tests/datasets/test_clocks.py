@@ -190,7 +190,8 @@ def test_a_stale_first_event_is_no_other_unit(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "s", events)
     for name in ("depth", "images"):
         renamed(folder, name, {ms: 200_000 + ms for ms in range(0, 301, 50)})
-    with pytest.raises(DataError, match=r"poses_ts\.txt covers 0 to 0\.3 s, events 200\.0.* to 200\.2") as caught:
+    expected = r"poses_ts\.txt covers 0 to 0\.3 s, events 200\.0.* to 200\.2"
+    with pytest.raises(DataError, match=expected) as caught:
         EventReplicaSequence(folder)
     assert "looks as if" not in str(caught.value)
     assert "look as if" not in str(caught.value)

@@ -160,6 +160,7 @@ def test_methods_of_events_refuse_in_one_line(tum: Path, method: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_recording_without_events_is_tracked(tiny_sequence: EventDepthSequence, tmp_path: Path) -> None:
     """The tiny room as NICE-SLAM would have written it, numbered from its start on, 20 images a second."""
     folder, camera = tmp_path / "tiny", tiny_sequence.camera
