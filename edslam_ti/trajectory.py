@@ -2,6 +2,7 @@
 
 import bisect
 import warnings
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -137,17 +138,23 @@ class PathDraft:
             self.corrections[index] = T_world_camera
 
 
-def write_tum(trajectory: Trajectory, path: Path) -> None:
-    """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world)."""
+def write_tum(trajectory: Trajectory, path: Path, time_offset: float = 0.0) -> None:
+    """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world).
+
+    `time_offset` seconds are added to every stamp, in decimals: stamps since the epoch come out to the
+    nanosecond, which float64 seconds do not hold.
+    """
+    offset = Decimal(time_offset)
     with atomic_file(path) as temporary, temporary.open("w") as file:
         file.write("# timestamp tx ty tz qx qy qz qw\n")
         for t, T in zip(trajectory.timestamps, trajectory.poses):
             q = Rotation.from_matrix(T[:3, :3]).as_quat()
-            file.write(f"{t:.9f} " + " ".join(f"{v:.9f}" for v in [*T[:3, 3], *q]) + "\n")
+            stamp = Decimal(f"{t:.9f}") + offset
+            file.write(f"{stamp:.9f} " + " ".join(f"{v:.9f}" for v in [*T[:3, 3], *q]) + "\n")
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory; '#' lines are comments; rows at or before the time of the last are dropped."""
+    """Read a TUM trajectory; '#' lines are comments; rows are sorted by time, the first of each is kept."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} not found")
     try:
@@ -163,8 +170,8 @@ def read_tum(path: Path) -> Trajectory:
     norms = np.linalg.norm(rows[:, 4:], axis=1)
     if np.any(norms < 1e-6):
         raise DataError(f"{path}: a quaternion is zero; expected unit quaternions qx qy qz qw")
-    keep = np.concatenate([[True], rows[1:, 0] > np.maximum.accumulate(rows[:-1, 0])])
-    rows = rows[keep]
+    _, first = np.unique(rows[:, 0], return_index=True)
+    rows = rows[first]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 RANKS: list[list[str]] = [
     ["kernels", "errors", "memory", "output", "open3d_loader"],
     ["config", "geometry", "camera", "events"],
-    ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
+    ["trajectory", "truth", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
     ["event_images"],
@@ -30,7 +30,8 @@ ORDERS: dict[str, list[str]] = {
     "ranks": [
         *("errors", "memory", "output", "open3d_loader", "kernels"),
         *("config", "geometry", "camera", "events"),
-        *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
+        *("trajectory", "truth", "depth_images", "ray_casting", "alignment", "simulation", "frame"),
+        "evaluation",
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
     "event_images": ["solve", "start_image", "contrast", "sharp"],
@@ -43,7 +44,7 @@ ORDERS: dict[str, list[str]] = {
         *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
         *("targets", "poses", "gaussian_mapper"),
     ],
-    "evaluation": ["trajectories", "lpips", "images", "meshes"],
+    "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "reading", "export", "pictures", "plots", "window", "views", "metrics", "folder"),
     ],
@@ -60,7 +61,7 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": ["config", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
-    "scipy": ["trajectory", "simulation", "mapping", "results"],
+    "scipy": ["trajectory", "truth", "simulation", "evaluation", "mapping", "results"],
     "cv2": ["alignment", "datasets", "simulation", "event_images", "tracking", "mapping", "results"],
     "OpenEXR": ["datasets"],
     "platformdirs": ["datasets"],

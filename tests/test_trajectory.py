@@ -108,14 +108,14 @@ def test_tum_line_is_time_position_and_quaternion_with_w_last(tmp_path: Path) ->
     assert [float(v) for v in line.split()] == [0.25, 1, 2, 3, 0, 0, 0, 1]
 
 
-def test_comments_and_repeated_times_are_passed_over(tmp_path: Path) -> None:
+def test_comments_and_repeated_times_are_passed_over_and_rows_are_sorted(tmp_path: Path) -> None:
     file = tmp_path / "t.txt"
     file.write_text(
         "# t x y z\n0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n1 9 0 0 0 0 0 1\n0.5 9 0 0 0 0 0 1\n2 2 0 0 0 0 0 1\n"
     )
     path = read_tum(file)
-    assert path.timestamps.tolist() == [0, 1, 2]
-    assert path.poses[:, 0, 3].tolist() == [0, 1, 2]
+    assert path.timestamps.tolist() == [0, 0.5, 1, 2]
+    assert path.poses[:, 0, 3].tolist() == [0, 9, 1, 2]
 
 
 @pytest.mark.parametrize(
