@@ -1,8 +1,8 @@
 """python apps/evaluate.py EST.txt TRUTH.txt [--mesh MESH.ply --recording DIR]
 
 Print the absolute and relative pose errors of a trajectory, both files in TUM format (t tx ty tz qx qy qz qw,
-seconds and metres): the numbers of evo_ape and evo_rpe. The truth is interpolated at the estimate's times, not
-across its holes. Lines at the end say what looks wrong with the truth.
+seconds and metres): the numbers of evo_ape and evo_rpe. The truth is interpolated at the estimate's times,
+not across its holes. Lines at the end say what looks wrong with the truth.
 With --mesh and --recording also the accuracy and completion of a mesh against the true surfaces that the
 camera of a simulated recording (apps/simulate.py) saw at the estimate's times.
 """

@@ -28,6 +28,7 @@ FARTHEST = 1e7  # m from the origin: map coordinates (UTM) end there
 SMALLEST_JUMP, SMALLEST_FLIP = 0.02, np.radians(10.0)  # m, rad between stamps that motion does not explain
 HARDEST_PUSH, HARDEST_TWIST = 100.0, 2000.0  # m/s^2, rad/s^2: cameras of robots and hands stay below
 UNUSUAL = 30.0  # times what motion between stamps usually changes by
+FASTER = 10.0  # times the usual speed
 
 
 def true_poses_at(truth: Trajectory, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -188,53 +189,67 @@ def impossible_poses(truth: Trajectory) -> np.ndarray:  # [T] bool
     left = np.flatnonzero(~far)
     if len(left) < 4:
         return far
-    times, steps = stamps[left], np.diff(stamps[left])
-    moved = np.diff(positions[left], axis=0)
-    R = truth.poses[left, :3, :3]
-    turned = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec()
-    limits = [
-        _Limit(_surprise(moved, steps), steps, SMALLEST_JUMP, HARDEST_PUSH),
-        _Limit(_surprise(turned, steps), steps, SMALLEST_FLIP, HARDEST_TWIST),
-    ]
-    cuts = np.flatnonzero(np.any([limit.is_passed for limit in limits], axis=0)) + 1
+    times, positions, rotations = stamps[left], positions[left], truth.poses[left, :3, :3]
+    steps = np.diff(times)
+    moved = np.diff(positions, axis=0)
+    turned = _turns(rotations[:-1], rotations[1:])
+    limits = (
+        _Limit(moved, steps, SMALLEST_JUMP, HARDEST_PUSH),
+        _Limit(turned, steps, SMALLEST_FLIP, HARDEST_TWIST),
+    )
+    cuts = np.flatnonzero(limits[0].is_passed | limits[1].is_passed) + 1
     if len(cuts) == 0:
         return far
     pieces = np.split(np.arange(len(left)), cuts)
     longest = max(range(len(pieces)), key=lambda n: len(pieces[n]))
-    fastest = [10 * float(np.percentile(np.linalg.norm(v, axis=1) / steps, 90)) for v in (moved, turned)]
 
-    def can_come(i: int, j: int) -> bool:  # indices of poses
-        gap = abs(times[j] - times[i])
-        distance = float(np.linalg.norm(positions[left[j]] - positions[left[i]]))
-        angle = float(Rotation.from_matrix(R[i].T @ R[j]).magnitude())
-        return all(
-            length <= speed * gap + limit.at(gap)
-            for length, speed, limit in zip((distance, angle), fastest, limits)
-        )
+    def can_come(before: np.ndarray, after: np.ndarray) -> bool:  # indices of poses of two pieces
+        i, j = before[-1], after[0]
+        gap = times[j] - times[i]
+        ways = (positions[j] - positions[i], _turns(rotations[i][None], rotations[j][None])[0])
+        inside = [int(piece[k]) for piece, k in ((before, -2), (after, 0)) if len(piece) > 1]
+        for way, steps_of, limit in zip(ways, (moved, turned), limits):
+            surprises = [np.linalg.norm(way - steps_of[k] / steps[k] * gap) for k in inside]
+            if min(surprises, default=np.linalg.norm(way)) > limit.at(gap):
+                return False
+        return True
 
-    kept = [pieces[longest]]
+    kept = pieces[longest]
     for piece in pieces[longest + 1 :]:
-        if can_come(kept[-1][-1], piece[0]):
-            kept.append(piece)
+        if can_come(kept, piece):
+            kept = np.concatenate([kept, piece])
     for piece in reversed(pieces[:longest]):
-        if can_come(kept[0][0], piece[-1]):
-            kept.insert(0, piece)
+        if can_come(piece, kept):
+            kept = np.concatenate([piece, kept])
     is_jump = np.ones(len(stamps), bool)
-    is_jump[left[np.concatenate(kept)]] = False
+    is_jump[left[kept]] = False
     return is_jump
 
 
 class _Limit:
-    """The largest surprise between two stamps that motion explains, by the time between them."""
+    """How far a step may be from that before or after it, as motion can explain, by the time it takes."""
 
-    def __init__(self, surprise: np.ndarray, steps: np.ndarray, smallest: float, hardest: float) -> None:
-        self._smallest, self._hardest = smallest, hardest
-        self._usual = UNUSUAL * float(np.percentile(surprise / steps**2, 90))
-        self.is_passed = surprise > self.at(steps)  # [T - 1] bool
+    def __init__(
+        self,
+        moved: np.ndarray,  # [S, 3] m or rad
+        steps: np.ndarray,  # [S] s
+        smallest: float,  # m or rad
+        hardest: float,  # m/s^2 or rad/s^2
+    ) -> None:
+        surprise, length = _surprise(moved, steps), np.linalg.norm(moved, axis=1)
+        usual = UNUSUAL * float(np.percentile(surprise / steps**2, 90))
+        self._smallest, self._acceleration = smallest, max(hardest, 2 * usual)
+        fastest = FASTER * float(np.percentile(length / steps, 90))
+        # Two turns by 180 degrees are alike, but too fast.
+        self.is_passed = (surprise > self.at(steps)) | (length > fastest * steps + self.at(steps))  # [S] bool
 
-    def at(self, step: "np.ndarray | float") -> "np.ndarray | float":
+    def at(self, step: "np.ndarray | float") -> np.ndarray:
         """Return it for steps in seconds."""
-        return np.maximum(self._smallest, max(self._hardest / 2, self._usual) * np.square(step))
+        return np.maximum(self._smallest, self._acceleration / 2 * np.square(step))
+
+
+def _turns(before: np.ndarray, after: np.ndarray) -> np.ndarray:  # [S, 3, 3] each -> [S, 3] rad
+    return np.asarray(Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec())
 
 
 def _surprise(moved: np.ndarray, steps: np.ndarray) -> np.ndarray:  # [S, 3], [S] -> [S]

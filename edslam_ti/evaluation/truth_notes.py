@@ -18,6 +18,7 @@ SCALE_DIFFERS = 0.005  # least, beside three times what errors leave uncertain
 CLEARLY_BETTER = 0.5  # share of an error that is left, if something explains it
 HIGH_RPE = 5.0  # times the ATE; errors of positions alone give at most 2
 SMALL_ATE, SMALL_RPE = 1e-3, 0.05  # cm: their ratio means nothing below
+SMALL_ERROR = 0.01  # cm of the truth's interpolation that never matters
 APART = 0.05  # share of the distance to what is seen by which views are apart, if orientations are wrong
 LONGEST_SHIFT = 0.25  # s between two clocks that is looked for
 SHORTEST_SHIFT = 0.002  # s
@@ -87,7 +88,7 @@ def _slow(errors: TrajectoryErrors, path: TruePath) -> list[str]:
     from_stamp = np.minimum(np.abs(times - path.stamps[k - 1]), np.abs(times - path.stamps[k]))
     between = float((from_stamp > 0.1 * path.median_step).mean())
     own = 100 * path.error_at_own_rate()  # cm
-    if not (between > 0.2 and own > 0.3 * errors.ate_rmse_cm):
+    if not (between > 0.2 and own > max(0.3 * errors.ate_rmse_cm, SMALL_ERROR)):
         return []
     return [
         f"truth comes every {1000 * path.median_step:.3g} ms: half way between, its interpolation is off by "
