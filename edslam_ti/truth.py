@@ -178,6 +178,7 @@ class TruePath:
 # --- poses that cannot be ---
 
 
+@np.errstate(over="ignore")  # whatever a file holds
 def impossible_poses(truth: Trajectory) -> np.ndarray:  # [T] bool
     """Return which poses of a truth cannot be: far from where those before and after them lead.
 
@@ -207,7 +208,7 @@ def impossible_poses(truth: Trajectory) -> np.ndarray:  # [T] bool
         i, j = before[-1], after[0]
         gap = times[j] - times[i]
         ways = (positions[j] - positions[i], _turns(rotations[i][None], rotations[j][None])[0])
-        inside = [int(piece[k]) for piece, k in ((before, -2), (after, 0)) if len(piece) > 1]
+        inside = [int(pair[0]) for pair in (before[-2:], after[:2]) if len(pair) > 1 and np.ptp(pair) == 1]
         for way, steps_of, limit in zip(ways, (moved, turned), limits):
             surprises = [np.linalg.norm(way - steps_of[k] / steps[k] * gap) for k in inside]
             if min(surprises, default=np.linalg.norm(way)) > limit.at(gap):
@@ -243,7 +244,7 @@ class _Limit:
         # Two turns by 180 degrees are alike, but too fast.
         self.is_passed = (surprise > self.at(steps)) | (length > fastest * steps + self.at(steps))  # [S] bool
 
-    def at(self, step: "np.ndarray | float") -> np.ndarray:
+    def at(self, step: np.ndarray | float) -> np.ndarray:
         """Return it for steps in seconds."""
         return np.maximum(self._smallest, self._acceleration / 2 * np.square(step))
 
@@ -267,8 +268,9 @@ def _jump_lengths(positions: np.ndarray, is_jump: np.ndarray) -> np.ndarray:  # 
     if len(kept) == 0:
         return np.full(int(is_jump.sum()), np.inf)
     before = kept[np.clip(np.searchsorted(kept, np.flatnonzero(is_jump)) - 1, 0, None)]
-    with np.errstate(over="ignore"):
-        lengths: np.ndarray = np.linalg.norm(positions[is_jump] - positions[before], axis=1)
+    moved = positions[is_jump] - positions[before]
+    largest = np.maximum(np.abs(moved).max(1, initial=0), 1e-12)  # squares of 1e200 are infinite
+    lengths: np.ndarray = largest * np.linalg.norm(moved / largest[:, None], axis=1)
     return lengths
 
 

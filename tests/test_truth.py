@@ -128,6 +128,13 @@ def test_several_poses_elsewhere_and_a_flipped_one_are_left_out() -> None:
     np.testing.assert_allclose(truth.jump_lengths[2:12], 0.4, atol=0.05)
 
 
+def test_stamp_far_away_is_no_jump_and_no_truth() -> None:
+    path = hand_held()
+    far = Trajectory(np.append(path.timestamps, 1e200), np.concatenate([path.poses, path.poses[:1]]))
+    _, is_known = true_poses_at(far, np.array([1.0, 3.0, 3.5, 1e199]))
+    assert is_known.tolist() == [True, True, False, False]
+
+
 def test_motion_is_no_jump() -> None:
     still = hand_held(100.0, 6.0)
     poses = still.poses

@@ -1,4 +1,4 @@
-"""Truth with holes, in other conventions, on other clocks: what a whole run says of it, and what it writes."""
+"""Truth with holes, in other conventions, on other clocks: what a run says of it, and what it writes."""
 
 import io
 import json
