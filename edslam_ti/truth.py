@@ -270,8 +270,9 @@ def _jump_lengths(positions: np.ndarray, is_jump: np.ndarray) -> np.ndarray:  # 
     before = kept[np.clip(np.searchsorted(kept, np.flatnonzero(is_jump)) - 1, 0, None)]
     moved = positions[is_jump] - positions[before]
     largest = np.maximum(np.abs(moved).max(1, initial=0), 1e-12)  # squares of 1e200 are infinite
-    lengths: np.ndarray = largest * np.linalg.norm(moved / largest[:, None], axis=1)
-    return lengths
+    with np.errstate(invalid="ignore"):
+        lengths = largest * np.linalg.norm(moved / largest[:, None], axis=1)
+    return np.where(np.isfinite(lengths), lengths, np.inf)
 
 
 def _continuous_quaternions(poses: np.ndarray) -> np.ndarray:  # [T, 4, 4] -> [T, 4]
