@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 RANKS: list[list[str]] = [
     ["kernels", "errors", "memory", "output", "open3d_loader", "cold_start"],
     ["config", "arguments", "geometry", "camera", "events", "tables"],
-    ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
+    ["trajectory", "truth", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
     ["event_images"],
@@ -31,7 +31,8 @@ ORDERS: dict[str, list[str]] = {
     "ranks": [
         *("errors", "memory", "output", "open3d_loader", "kernels", "cold_start"),
         *("config", "arguments", "geometry", "camera", "events", "tables"),
-        *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
+        *("trajectory", "truth", "depth_images", "ray_casting", "alignment", "simulation", "frame"),
+        "evaluation",
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
     "event_images": ["change", "noisy", "solve", "contrast", "sharp"],
@@ -53,7 +54,7 @@ ORDERS: dict[str, list[str]] = {
         *("gaussian_ply", "gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion"),
         *("keyframes", "densification", "recolouring", "targets", "poses", "gaussian_mapper"),
     ],
-    "evaluation": ["trajectories", "lpips", "images", "meshes"],
+    "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
     ],
@@ -70,7 +71,7 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": ["config", "arguments", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
-    "scipy": ["trajectory", "simulation", "mapping", "results"],
+    "scipy": ["trajectory", "truth", "simulation", "evaluation", "mapping", "results"],
     "cv2": [
         *("alignment", "depth_images", "datasets", "simulation", "event_images", "tracking", "mapping"),
         "results",

@@ -50,7 +50,8 @@ KEYS = {
 NAMES = [
     *("dataset", "scene", "description", "method", "ate_rmse_cm", "ate_mean_cm", "ate_median_cm"),
     *("ate_max_cm", "ate_rmse_sim3_cm", "rpe_trans_cm", "rpe_rot_deg", "ate_frontend_rmse_cm"),
-    *("path_length_m", "psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "psnr_db_all"),
+    *("path_length_m", "ate_scale_sim3", "num_truth_poses_compared", "truth_coverage", "truth_notes"),
+    *("psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "psnr_db_all"),
     *("psnr_corrected_db_all", "ssim_corrected_all", "lpips_corrected_all", "ssim_all", "lpips_all"),
     *("depth_l1_cm", "num_held_out_views", "psnr_mapped_db", "psnr_mapped_corrected_db"),
     *("ssim_mapped_corrected", "lpips_mapped_corrected", "psnr_mapped_db_all"),
@@ -59,7 +60,14 @@ NAMES = [
     *("psnr_novel_corrected_db", "ssim_novel_corrected", "lpips_novel_corrected", "psnr_novel_db_all"),
     *("psnr_novel_corrected_db_all", "ssim_novel_corrected_all", "lpips_novel_corrected_all"),
     *("ssim_novel_all", "lpips_novel_all", "depth_l1_novel_cm", "num_novel_views", "mesh_accuracy_cm"),
-    *("mesh_completion_cm", "mesh_completion_ratio_5cm", "num_frames", "num_lost_frames", "num_keyframes"),
+    *(
+        "mesh_completion_cm",
+        "mesh_completion_ratio_5cm",
+        "time_offset_s",
+        "num_frames",
+        "num_lost_frames",
+        "num_keyframes",
+    ),
     *("num_gaussians", "num_events", "num_mapping_steps", "num_hot_pixels", "contrast_threshold"),
     *("contrast_threshold_source", "contrast_threshold_positive", "contrast_threshold_negative"),
     *("contrast_threshold_deviation", "tracking_hz", "tracking_s", "mapping_s", "refinement_s", "device"),
@@ -479,7 +487,7 @@ def test_failed_saving_leaves_no_half_written_folder(
     def fail(*arguments: Any, **options: Any) -> None:
         raise error
 
-    monkeypatch.setattr(results, "plot_trajectory", fail)
+    monkeypatch.setattr(results, "write_tum", fail)
     config = config_for(tiny_folder, tmp_path, duration=0.2, mapping={"enabled": False})
     with pytest.raises(type(error)):
         quiet_run(config)

@@ -14,6 +14,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_path
 
 
 @dataclass(frozen=True)
@@ -125,10 +126,8 @@ class EventDepthSequence(ABC):
         return self.image_or_none(k) if abs(self.image_timestamps[k] - timestamp) <= tolerance else None
 
     def true_pose(self, timestamp: float) -> np.ndarray | None:
-        """Return the true pose at a time inside the recorded path (Eq. 9 between its stamps)."""
-        if self.truth is None or not self.truth.covers(timestamp):
-            return None
-        return self.truth.at(timestamp)
+        """Return the true pose at a time, None where `true_poses_at` does not know it."""
+        return None if self.truth is None else true_path(self.truth).pose_at(timestamp)
 
 
 def stamp_text(sequence: EventDepthSequence, time: float) -> str:

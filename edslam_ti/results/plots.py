@@ -14,6 +14,7 @@ from edslam_ti.mapping.volume import MeshView
 from edslam_ti.results.pictures import new_figure, save_figure
 from edslam_ti.results.reading import Result, load_result
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_poses_at
 from edslam_ti.viewer import frustum_lines
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 START, END = "#009E73", "#D55E00"
 MAX_DRAWN_POINTS = 60_000
+HOLE = 1.5  # usual steps: the true path is not drawn across longer ones
 
 
 # ---------------------------------------------------------------- trajectories
@@ -71,11 +73,13 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
     if not paths:
         raise DataError(f"{path.name}: expected at least one trajectory with poses, got none")
     figure = new_figure(11, 5)
-    views = _top_and_side(next(e for e in estimates.values() if len(e)) if truth is None else truth)
+    first_estimate = next(e for e in estimates.values() if len(e))
+    true = None if truth is None else _known_at(truth, first_estimate.timestamps)
+    views = _top_and_side(true or first_estimate)
     axes = figure.subplots(1, 2)
     for ax, view in zip(axes, views):
-        if truth is not None and len(truth):
-            _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
+        if true is not None:
+            _draw_path(ax, _with_holes(true), view, color="black", label="truth", linewidth=1.2)
         only = next(iter(paths.values())) if len(paths) == 1 else None
         if only is not None and np.isfinite(only.errors).sum() >= 2:
             bar = _draw_errors(ax, only, view)
@@ -93,6 +97,20 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
         + ("" if truth is None else " (rigidly aligned)")
     )
     save_figure(figure, path)
+
+
+def _known_at(truth: Trajectory, times: np.ndarray) -> Trajectory | None:
+    """Return the truth at those times at which it is known; None if there is none."""
+    poses, is_known = true_poses_at(truth, times)
+    return Trajectory(times[is_known], poses[is_known]) if is_known.any() else None
+
+
+def _with_holes(path: Trajectory) -> np.ndarray:  # [F + number of holes, 3]
+    """Return positions with a row of NaN in every hole, so that no line is drawn across it."""
+    steps = np.diff(path.timestamps)
+    is_hole = steps > HOLE * np.median(steps) if len(steps) else np.zeros(0, bool)
+    after = np.flatnonzero(is_hole) + 1
+    return np.insert(path.poses[:, :3, 3], after, np.nan, axis=0)
 
 
 @dataclass(frozen=True)
@@ -217,7 +235,7 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
         ax = figure.add_subplot(grid[1, k])
         _draw_points(ax, runs, view)
         if truth is not None:
-            _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
+            _draw_path(ax, _with_holes(truth), view, color="black", label="truth", linewidth=1.2)
         for run, color in zip(runs, colours()):
             _draw_path(ax, run.trajectory.poses[:, :3, 3], view, color=color, label=run.title, linewidth=2)
         _mark_ends(ax, runs[0].trajectory.poses[:, :3, 3], view)

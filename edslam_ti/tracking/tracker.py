@@ -58,15 +58,21 @@ class Tracker(Protocol):
 class TruePoses:
     """A tracker that knows: `--poses truth`, for mapping alone."""
 
-    def __init__(self, true_pose: Callable[[float], np.ndarray | None]) -> None:
-        self._true_pose = true_pose
+    def __init__(
+        self,
+        true_pose: Callable[[float], np.ndarray | None],
+        likely_pose: Callable[[float], np.ndarray] | None = None,  # where there is no true one
+    ) -> None:
+        self._true_pose, self._likely_pose = true_pose, likely_pose
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the true pose."""
+        """Return the true pose; where it is not known, the frame is lost."""
         pose = self._true_pose(frame.timestamp)
-        if pose is None:
-            return TrackingResult(guess, False, 0.0, "no true pose at this time")
-        return TrackingResult(pose, True, 1.0)
+        if pose is not None:
+            return TrackingResult(pose, True, 1.0)
+        if self._likely_pose is not None:
+            guess = self._likely_pose(frame.timestamp)
+        return TrackingResult(guess, False, 0.0, "no true pose at this time")
 
     def consistency(self, trajectory: Trajectory) -> None:
         """Return nothing: true poses agree with themselves."""
