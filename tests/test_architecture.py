@@ -56,7 +56,19 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
-        *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
+        *(
+            "run",
+            "trust",
+            "reading",
+            "export",
+            "maps",
+            "pictures",
+            "plots",
+            "window",
+            "views",
+            "metrics",
+            "folder",
+        ),
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),

@@ -20,6 +20,7 @@ from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_
 from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
 from edslam_ti.results.run import Run
+from edslam_ti.results.trust import Trust
 from edslam_ti.results.views import save_views
 from edslam_ti.trajectory import write_tum
 
@@ -35,7 +36,7 @@ def save(run: Run, console: Console) -> Path:
     parent = config.out / run.sequence.dataset / run.sequence.scene / config.method
     folder = _unused(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
     started = time.perf_counter()
-    truth = run.true_trajectory()
+    truth, trust = run.true_trajectory(), Trust.of(slam)
     slice_s = slice_of(run, truth)
     with console.status("saving"), atomic_folder(folder) as partial:
         offset = run.sequence.time_offset  # files carry the recording's own stamps
@@ -43,15 +44,16 @@ def save(run: Run, console: Console) -> Path:
         write_tum(slam.frontend_trajectory, partial / "trajectory_frontend_tum.txt", offset)
         if truth is not None:
             write_tum(truth, partial / "truth_tum.txt", offset)
+        run.attempt("poses.csv", lambda: trust.write(partial / "poses.csv", offset), otherwise=None)
         (partial / "config.yaml").write_text(config.to_yaml())
         _write_log(run, partial)
         views = save_views(run, truth, slice_s, partial / "renders")
         mesh = _save_map(run, views["held out"].fit, partial)
-        metrics = run_metrics(run, truth, slice_s, views, mesh)
-        _draw_trajectory(run, partial / "trajectory.png")
+        metrics = run_metrics(run, truth, slice_s, views, mesh, trust)
+        _draw_trajectory(run, trust, partial / "trajectory.png")
         metrics |= cost_metrics(run, saving_seconds=time.perf_counter() - started)
         (partial / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        for line in metrics["truth_notes"]:
+        for line in (*metrics["truth_notes"], *metrics["problems"]):
             run.note(line)
         run.note("seconds per frame: " + _listed(metrics["seconds_per_frame"]))
         run.note("saved")
@@ -65,9 +67,12 @@ def _write_log(run: Run, folder: Path) -> None:
     (folder / "log.txt").write_text("\n".join(run.messages) + "\n")
 
 
-def _draw_trajectory(run: Run, path: Path) -> None:
+def _draw_trajectory(run: Run, trust: Trust, path: Path) -> None:
     estimates = {run.config.method: run.slam.trajectory}
-    run.attempt(path.name, lambda: plot_trajectory(path, estimates, run.sequence.truth), otherwise=None)
+    sigmas = trust.sigmas[0] if trust.is_measured else None
+    run.attempt(
+        path.name, lambda: plot_trajectory(path, estimates, run.sequence.truth, sigmas), otherwise=None
+    )
 
 
 # --- the map ---
@@ -149,7 +154,11 @@ def _print_summary(metrics: Metrics, left_out: list[str], console: Console) -> N
 
     scale, coverage = metrics["ate_scale_sim3"], metrics["truth_coverage"]
     of_scale = "" if scale is None else f" (Sim(3) {show('ate_rmse_sim3_cm', 'cm')}, scale {scale:.4f})"
-    of_truth = ""
+    of_truth = of_sigma = ""
+    if metrics["sigma_position_end_cm"] is not None:
+        of_sigma = (
+            f"sigma {show('sigma_position_median_cm', 'cm')} (end {show('sigma_position_end_cm', 'cm')}), "
+        )
     if coverage is not None:
         of_truth = f"{metrics['num_truth_poses_compared']} compared with truth ({100 * coverage:.0f} %), "
     console.print(
@@ -157,9 +166,9 @@ def _print_summary(metrics: Metrics, left_out: list[str], console: Console) -> N
         f"{show('rpe_rot_deg', 'deg')}  "
         f"PSNR {show('psnr_corrected_db', 'dB')} corrected, {show('psnr_db', 'dB')} raw  "
         f"depth L1 {show('depth_l1_cm', 'cm')}\n"
-        f"{metrics['num_frames']} frames, {metrics['num_lost_frames']} lost, {of_truth}"
+        f"{metrics['num_frames']} frames, {metrics['num_lost_frames']} lost, {of_sigma}{of_truth}"
         f"{metrics['num_gaussians']} Gaussians, tracking {show('tracking_hz', 'Hz')}, "
         f"{metrics['wall_s']:.0f} s in all, {metrics['peak_memory_mb']:.0f} MB"
     )
-    for line in (*metrics["truth_notes"], *left_out):
+    for line in (*metrics["data_notes"], *metrics["problems"], *metrics["truth_notes"], *left_out):
         console.print(line, style="yellow", markup=False, highlight=False, soft_wrap=True)

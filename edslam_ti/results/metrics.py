@@ -14,6 +14,7 @@ from edslam_ti.evaluation.meshes import mesh_errors
 from edslam_ti.evaluation.trajectories import ate_rmse_cm, inceventgs_slice, trajectory_errors
 from edslam_ti.evaluation.truth_notes import truth_notes
 from edslam_ti.results.run import Run
+from edslam_ti.results.trust import Trust
 from edslam_ti.results.views import ViewNumbers
 from edslam_ti.trajectory import Trajectory
 
@@ -83,6 +84,7 @@ def run_metrics(
     slice_s: tuple[float, float] | None,  # seconds, of `slice_of`
     views: dict[str, ViewNumbers],  # by kind
     mesh: Any | None,  # Open3D TriangleMesh, None: the run made none
+    trust: Trust,
 ) -> Metrics:
     """Return all metrics but those of `cost_metrics`."""
     config, sequence, slam = run.config, run.sequence, run.slam
@@ -104,6 +106,9 @@ def run_metrics(
         "num_mapping_steps": of_map.pop("num_mapping_steps", None),
         "num_hot_pixels": of_map.pop("num_hot_pixels", None),
         **of_map,
+        **trust.metrics(),
+        "num_dropped_events": sequence.num_dropped_events,
+        "data_notes": list(sequence.notes),
         "contrast_threshold": _rounded(run.contrast.value),
         "contrast_threshold_source": run.contrast.source,
         "contrast_threshold_positive": _rounded(run.contrast.positive),

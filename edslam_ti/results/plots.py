@@ -62,21 +62,32 @@ def align_to_truth(estimate: Trajectory, truth: Trajectory | None) -> AlignedPat
     return AlignedPath(positions @ T[:3, :3].T + T[:3, 3], unknown)
 
 
-def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> None:
+def plot_trajectory(
+    path: Path,
+    estimates: Mapping[str, Trajectory],
+    truth: Trajectory | None,
+    sigmas: np.ndarray | None = None,  # [F] metres, of the first estimate's positions
+) -> None:
     """Draw top and side views of estimates, aligned to the truth when there is one.
 
-    A single estimate is coloured by its position error; several by name.
+    A single estimate is coloured by its position error; several by name. Sigmas are drawn as a band over
+    time, with the error where the truth is known.
     """
     paths = {
         name: align_to_truth(estimate, truth) for name, estimate in estimates.items() if len(estimate) > 0
     }
     if not paths:
         raise DataError(f"{path.name}: expected at least one trajectory with poses, got none")
-    figure = new_figure(11, 5)
+    figure = new_figure(11, 5) if sigmas is None else new_figure(11, 7)
     first_estimate = next(e for e in estimates.values() if len(e))
     true = None if truth is None else _known_at(truth, first_estimate.timestamps)
     views = _top_and_side(true or first_estimate)
-    axes = figure.subplots(1, 2)
+    grid = figure.add_gridspec(
+        1 if sigmas is None else 2, 2, height_ratios=None if sigmas is None else (5, 2)
+    )
+    axes = [figure.add_subplot(grid[0, k]) for k in range(2)]
+    if sigmas is not None:
+        _draw_sigmas(figure.add_subplot(grid[1, :]), first_estimate, next(iter(paths.values())), sigmas)
     for ax, view in zip(axes, views):
         if true is not None:
             _draw_path(ax, _with_holes(true), view, color="black", label="truth", linewidth=1.2)
@@ -97,6 +108,18 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
         + ("" if truth is None else " (rigidly aligned)")
     )
     save_figure(figure, path)
+
+
+def _draw_sigmas(ax: "Axes", estimate: Trajectory, aligned: AlignedPath, sigmas: np.ndarray) -> None:
+    """Draw twice the sigma of every position as a band over time, and the error where it is known."""
+    seconds = estimate.timestamps - estimate.timestamps[0]
+    ax.fill_between(seconds, 0, 200 * sigmas, color=COLOURS[5], alpha=0.4, linewidth=0, label="2 sigma")
+    if np.isfinite(aligned.errors).any():
+        ax.plot(seconds, 100 * aligned.errors, color=COLOURS[1], linewidth=1.2, label="position error")
+    ax.set(xlabel="seconds", ylabel="[cm]", xlim=(0, max(float(seconds[-1]), 1e-3)))
+    ax.set_ylim(bottom=0)
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, framealpha=0.8)
 
 
 def _known_at(truth: Trajectory, times: np.ndarray) -> Trajectory | None:
