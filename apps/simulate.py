@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich.markup import escape
 from rich.progress import Progress
 
 from edslam_ti.command_line import launch, parse_arguments
+from edslam_ti.errors import plain
 from edslam_ti.simulation.catalogue import ROOM_NAMES
 from edslam_ti.simulation.command import Placement, record
 from edslam_ti.simulation.settings import SimulationConfig
@@ -35,7 +37,7 @@ def simulate(
     """Simulate a recording.
 
     Args:
-        out: folder that receives the recording (replaced when it exists)
+        out: new or empty folder that receives the recording; an older recording there is replaced
         scene: built-in room (room0, room2, office0, office2, office3) or wall, corridor, kitchen, ...
         mesh: textured or vertex-coloured mesh file instead of a room
         mesh_scale: factor from the mesh's unit to metres
@@ -49,7 +51,7 @@ def simulate(
     """
     placement = Placement(position, look_at, up, trajectory_scale, trajectory_start)
     with Progress(transient=True) as bar:
-        task = bar.add_task(f"simulating {mesh.name if mesh else scene}", total=1.0)
+        task = bar.add_task(f"simulating {escape(plain(mesh.name if mesh else str(scene)))}", total=1.0)
         written = record(
             scene_name=scene,
             mesh=mesh,
@@ -62,7 +64,7 @@ def simulate(
             progress=lambda share: bar.update(task, completed=share),
         )
     print(
-        f"{written.folder}: {written.duration:g} s, {written.num_events} events, "
+        f"{plain(written.folder, 4096)}: {written.duration:g} s, {written.num_events} events, "
         f"{written.num_depth_images} depth images, {written.num_images} images"
     )
     if scene in ROOM_NAMES:

@@ -1,8 +1,25 @@
-"""Errors a user can mend. Each message says what was expected, what came, and what to do."""
+"""Errors a user can mend. Each message says what was expected, what came, and what to do, in one line."""
+
+LONGEST_MESSAGE = 1000  # characters
+LONGEST_VALUE = 200  # characters of one value from a file
+
+
+def plain(value: object, limit: int = LONGEST_VALUE) -> str:
+    """Return a text that is safe to print: one line of at most `limit` characters, nothing invisible.
+
+    Control characters and halves of surrogate pairs become escapes; what is too long is cut.
+    """
+    text = str(value)
+    if len(text) > limit:
+        text = f"{text[: limit - 4]} ..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 class EdSlamError(ValueError):
     """Root of every error caused by input, not by a defect; apps print it as one line, exit code 1."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(plain(message, LONGEST_MESSAGE))
 
 
 class ConfigError(EdSlamError):

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 # Ranks from the bottom to the top. A name is a module of edslam_ti or a folder of it. Modules of one rank do
 # not import each other, but for those in the order of ORDERS.
 RANKS: list[list[str]] = [
-    ["kernels", "errors", "memory", "output", "open3d_loader"],
+    ["kernels", "errors", "memory", "leftovers", "output", "open3d_loader"],
     ["config", "geometry", "camera", "events"],
     ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
@@ -28,7 +28,7 @@ RANKS: list[list[str]] = [
 # that are not listed may import freely inside, without a cycle.
 ORDERS: dict[str, list[str]] = {
     "ranks": [
-        *("errors", "memory", "output", "open3d_loader", "kernels"),
+        *("errors", "memory", "leftovers", "output", "open3d_loader", "kernels"),
         *("config", "geometry", "camera", "events"),
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
