@@ -34,14 +34,8 @@ def remove_leftovers(folder: Path) -> list[Path]:
     A folder that was moved away for a new one that never came gets its name back. What cannot be read or
     removed stays: it is in nobody's way.
     """
-    try:
-        matches = [match for name in os.listdir(folder) if (match := _NAME.fullmatch(name))]
-    except OSError:
-        return []
     removed = []
-    for match in matches:
-        if match["host"] != _this_host() or _is_running(int(match["process"])):
-            continue
+    for match in _of_dead_processes(folder):
         path = folder / match[0]
         place = folder / (match["stem"] + (match["suffix"] or ""))
         try:
@@ -57,6 +51,19 @@ def remove_leftovers(folder: Path) -> list[Path]:
             continue
         removed.append(path)
     return removed
+
+
+def left_behind(folder: Path, stem: str) -> list[Path]:
+    """Return the temporary files for `stem` in a folder whose process has ended on this host."""
+    return [folder / match[0] for match in _of_dead_processes(folder) if match["stem"] == stem]
+
+
+def _of_dead_processes(folder: Path) -> list[re.Match[str]]:
+    try:
+        found = [match for name in os.listdir(folder) if (match := _NAME.fullmatch(name))]
+    except OSError:
+        return []
+    return [m for m in found if m["host"] == _this_host() and not _is_running(int(m["process"]))]
 
 
 @cache

@@ -8,7 +8,10 @@ import os
 import textwrap
 import types
 
+from edslam_ti.kernels import compiled_cache
+
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("HOME", compiled_cache.home())
 
 import numpy as np
 import taichi as ti
@@ -62,15 +65,16 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
 
 def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:
     checks = {} if debug is None else {"debug": debug}
-    ti.init(
-        arch=ti.cuda if arch == "cuda" else ti.cpu,
-        default_fp=ti.f64 if precision == "f64" else ti.f32,
-        cpu_max_num_threads=threads,
-        fast_math=False,
-        offline_cache=True,
-        log_level=ti.ERROR,
-        **checks,
-    )
+    with compiled_cache.opened(ti) as kept:
+        ti.init(
+            arch=ti.cuda if arch == "cuda" else ti.cpu,
+            default_fp=ti.f64 if precision == "f64" else ti.f32,
+            cpu_max_num_threads=threads,
+            fast_math=False,
+            log_level=ti.ERROR,
+            **kept,
+            **checks,
+        )
 
 
 def is_gpu() -> bool:

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 # Ranks from the bottom to the top. A name is a module of edslam_ti or a folder of it. Modules of one rank do
 # not import each other, but for those in the order of ORDERS.
 RANKS: list[list[str]] = [
-    ["kernels", "errors", "memory", "leftovers", "output", "open3d_loader"],
+    ["kernels", "errors", "memory", "leftovers", "output", "cache", "open3d_loader"],
     ["config", "geometry", "camera", "events"],
     ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
@@ -28,7 +28,7 @@ RANKS: list[list[str]] = [
 # that are not listed may import freely inside, without a cycle.
 ORDERS: dict[str, list[str]] = {
     "ranks": [
-        *("errors", "memory", "leftovers", "output", "open3d_loader", "kernels"),
+        *("errors", "memory", "leftovers", "output", "cache", "open3d_loader", "kernels"),
         *("config", "geometry", "camera", "events"),
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
@@ -60,7 +60,7 @@ LIBRARIES: dict[str, list[str]] = {
     "scipy": ["trajectory", "simulation", "mapping", "results"],
     "cv2": ["alignment", "datasets", "simulation", "event_images", "tracking", "mapping", "results"],
     "OpenEXR": ["datasets"],
-    "platformdirs": ["datasets"],
+    "platformdirs": ["cache"],
     "evo": ["evaluation"],
     "skimage": ["evaluation"],
     "kiss_icp": ["baselines"],
@@ -191,7 +191,7 @@ def wrong_libraries(module: str) -> Iterator[str]:
 def wrong_kernels(module: str) -> Iterator[str]:
     if not is_in(module, ["kernels"]):
         return
-    if not all(is_in(name, ["kernels"]) for name in our_imports(module)):
+    if not all(is_in(name, ["kernels", "cache", "leftovers"]) for name in our_imports(module)):
         yield f"{module}: kernels know nothing of SLAM"
     if "__future__" in imports(module):
         yield f"{module}: Taichi rejects annotations that are strings"

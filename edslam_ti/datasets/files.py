@@ -1,23 +1,16 @@
 """Reading the small files around an event stream: number tables, images, depth images, numbered names."""
 
-import os
 import re
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
-import platformdirs
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
 
 FARTHEST_DEPTH = 1e4  # m; renderers write 1e10 or 65504 (half-precision maximum) where they hit nothing
-
-
-def cache_folder() -> Path:
-    """Return where generated and converted data is kept; the environment's EDSLAM_CACHE moves it."""
-    return Path(os.environ.get("EDSLAM_CACHE") or platformdirs.user_cache_dir("edslam_ti"))
 
 
 def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, columns] float64

@@ -26,12 +26,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edslam_ti.cache import cached
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.datasets.event_replica import LATEST_START, read_camera
 from edslam_ti.datasets.files import (
-    cache_folder,
     image_size,
     numbered_files,
     read_depth,
@@ -173,7 +173,7 @@ def open_text_events(path: Path, width: int, height: int) -> EventFile:
         raise DataError(f"{path}: the file is empty; expected lines 't x y p'")
     identity = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}"
     digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
-    binary = cache_folder() / "events" / f"{path.parent.name}_{digest}.npy"
+    binary = cached(Path("events") / f"{path.parent.name}_{digest}.npy")
     if not binary.is_file():
         if status.st_size > SLOW_TO_PARSE:
             # A warning shows on stderr where the program has not set up logging: the user is made to wait.

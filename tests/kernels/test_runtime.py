@@ -66,6 +66,6 @@ def test_a_process_leaves_its_compiled_kernels_to_the_next_one(tmp_path: Path) -
         "from edslam_ti import kernels; from edslam_ti.kernels.time_surface import compile_kernels; "
         "kernels.init(); compile_kernels()"
     )
-    environment = os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)}
+    environment = os.environ | {"EDSLAM_CACHE": str(tmp_path)}
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
     assert list(tmp_path.rglob("*.tic"))
