@@ -10,7 +10,10 @@ ROOT = Path(__file__).parents[1]
 # Ranks from the bottom to the top. A name is a module of edslam_ti or a folder of it. Modules of one rank do
 # not import each other, but for those in the order of ORDERS.
 RANKS: list[list[str]] = [
-    ["kernels", "errors", "memory", "leftovers", "output", "cache", "open3d_loader"],
+    [
+        *("kernels", "errors", "memory", "leftovers", "output", "cache"),
+        *("open3d_loader", "ply_check", "mesh_reading"),
+    ],
     ["config", "geometry", "camera", "events"],
     ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
@@ -28,7 +31,8 @@ RANKS: list[list[str]] = [
 # that are not listed may import freely inside, without a cycle.
 ORDERS: dict[str, list[str]] = {
     "ranks": [
-        *("errors", "memory", "leftovers", "output", "cache", "open3d_loader", "kernels"),
+        *("errors", "memory", "leftovers", "output", "cache"),
+        *("open3d_loader", "ply_check", "mesh_reading", "kernels"),
         *("config", "geometry", "camera", "events"),
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
@@ -74,6 +78,7 @@ LIBRARIES: dict[str, list[str]] = {
 }
 USES_OPEN3D = [
     *(
+        "mesh_reading",
         "ray_casting",
         "simulation",
         "evaluation",
