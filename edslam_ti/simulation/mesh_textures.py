@@ -54,7 +54,7 @@ def check_glb_textures(path: Path) -> None:
 
 
 def check_image(name: str, data: bytes) -> None:
-    """Raise `DataError` unless the bytes of an image are whole: decoders return the upper part of a cut one."""
+    """Raise `DataError` unless an image is whole; decoders return the upper part of one that is cut off."""
     fault = None
     if data.startswith(PNG):
         fault = _png_fault(data)
