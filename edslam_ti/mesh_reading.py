@@ -6,6 +6,7 @@ checked first; all others are read in a child process, where a crash is an error
 
 import contextlib
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -154,6 +155,9 @@ def _read_in_child(kind: str, path: Path) -> list[MeshPart]:
             raise DataError(
                 f"{path}: not readable as a mesh: the reader crashed{reason}; the file is damaged"
             )
+        complaint = re.search(rb"RPly: (.*)", done.stdout + done.stderr)
+        if complaint is not None:  # what it returns then is partly memory that nobody has written
+            raise DataError(f"{path}: not readable as a mesh: {plain(complaint[1].decode(errors='replace'))}")
         with np.load(result) as arrays:
             parts: list[dict[str, np.ndarray]] = [{} for _ in range(int(arrays["count"]))]
             for name in arrays.files:

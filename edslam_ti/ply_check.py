@@ -19,6 +19,8 @@ TYPES = {
     **{"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+# Open3D gives up reading, without an error, where one of three is missing.
+TRIPLES = {"positions": ("x", "y", "z"), "normals": ("nx", "ny", "nz"), "colours": ("red", "green", "blue")}
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -46,8 +48,12 @@ def is_sound_ply(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(LONGEST_HEADER)
         elements, order, offset = _header(path, head)
-        if order is None or not all(element.count for element in elements):
+        names = [element.name for element in elements]
+        if order is None or not all(e.count for e in elements) or len(set(names)) < len(names):
             return False
+        for element in elements:
+            if element.name == "vertex":
+                _check_properties(path, [prop.name for prop in element.properties if prop.length is None])
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     num_vertices = next((e.count for e in elements if e.name == "vertex"), 0)
     for element in elements:
@@ -124,6 +130,17 @@ def _rows(
     if fitting < element.count:
         raise _too_short(path, element, data, offset, size)
     return rows
+
+
+def _check_properties(path: Path, found: list[str]) -> None:
+    """Raise unless vertices have positions, and each of three values or none."""
+    for what, names in TRIPLES.items():
+        missing = [name for name in names if name not in found]
+        if missing and (what == "positions" or len(missing) < len(names)):
+            raise DataError(
+                f"{path}: expected the vertices' {what} as {', '.join(names)}, its header has no "
+                f"'{missing[0]}'"
+            )
 
 
 def _too_short(path: Path, element: _Element, data: mmap.mmap, offset: int, size: int) -> DataError:

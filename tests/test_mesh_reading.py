@@ -97,6 +97,8 @@ DAMAGES: dict[str, tuple[Any, str]] = {
         lambda d: d[: header(d)] + struct.pack("<d", float("nan")) + d[header(d) + 8 :],
         r"vertex 0 \(counted from 0\) holds a value that is not finite",
     ),
+    "no colour green": (replaced(b"uchar green", b"uchar foo"), "colours as red, green, blue, .* no 'green'"),
+    "no position y": (replaced(b"double y", b"double foo"), "positions as x, y, z, its header has no 'y'"),
     "another file": (lambda d: b"\x1b]0;title\x07" * 9, r"begins with '\\x1b\]0;title\\x07"),
 }
 
@@ -110,6 +112,16 @@ def test_damage_is_named(mesh: Path, name: str) -> None:
     with pytest.raises(DataError, match=message) as caught:
         read_triangle_mesh(mesh)
     assert len(str(caught.value)) < 600
+
+
+def test_a_text_file_that_is_cut_off_is_refused(mesh: Path) -> None:
+    o3d = load_open3d()
+    text = mesh.with_name("text.ply")
+    assert o3d.io.write_triangle_mesh(str(text), o3d.io.read_triangle_mesh(str(mesh)), write_ascii=True)
+    data = text.read_bytes()
+    text.write_bytes(data[: len(data) * 2 // 3])
+    with pytest.raises(DataError, match="text.ply: not readable as a mesh: "):
+        read_triangle_mesh(text)
 
 
 def test_random_bytes_are_refused_or_read_but_never_crash(mesh: Path) -> None:
