@@ -120,7 +120,7 @@ def test_a_text_file_that_is_cut_off_is_refused(mesh: Path) -> None:
     assert o3d.io.write_triangle_mesh(str(text), o3d.io.read_triangle_mesh(str(mesh)), write_ascii=True)
     data = text.read_bytes()
     text.write_bytes(data[: len(data) * 2 // 3])
-    with pytest.raises(DataError, match="text.ply: not readable as a mesh: "):
+    with pytest.raises(DataError, match=r"text\.ply: not readable as a mesh: "):
         read_triangle_mesh(text)
 
 
