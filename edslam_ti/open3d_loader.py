@@ -1,11 +1,15 @@
 """The one place that imports Open3D: lazily, and with libusb-1.0 supplied where the system lacks it."""
 
 import ctypes
-import ctypes.util
 from functools import cache
 from types import ModuleType
 
 from edslam_ti.errors import EdSlamError
+
+LIBUSB = (
+    "libusb-1.0.so.0",
+    "libusb-1.0.dylib",
+)  # as the linker knows it; finding it by search runs a compiler
 
 
 @cache
@@ -15,7 +19,7 @@ def load_open3d() -> ModuleType:
     Open3D links against libusb-1.0, which a stock Debian/Ubuntu does not have; the PyPI package
     `libusb-package` carries the same library, and loading it first satisfies the linker.
     """
-    if ctypes.util.find_library("usb-1.0") is None:
+    if not any(_is_loaded(name) for name in LIBUSB):
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
@@ -28,3 +32,11 @@ def load_open3d() -> ModuleType:
         ) from error
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
+
+
+def _is_loaded(name: str) -> bool:
+    try:
+        ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+    except OSError:
+        return False
+    return True

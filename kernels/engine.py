@@ -7,6 +7,7 @@ when this file is first imported. Both engines share the API that the kernels us
 import contextlib
 import importlib
 import os
+import tempfile
 from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ def _load(name: str) -> ModuleType:
     if name not in ENGINES:
         raise ImportError(f"EDSLAM_ENGINE: expected {' or '.join(map(repr, ENGINES))}, got {name!r}")
     try:
-        with _without_banner(name):
+        with _without_banner(name), with_home():
             return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name != name:
@@ -46,6 +47,20 @@ def _without_banner(name: str) -> Iterator[None]:
         yield
     finally:
         del os.environ[variable]
+
+
+@contextlib.contextmanager
+def with_home() -> Iterator[None]:
+    """Give the engine a HOME, without which it aborts, and leave the environment as it was."""
+    if "HOME" in os.environ:
+        yield
+        return
+    folder = os.path.expanduser("~")
+    os.environ["HOME"] = folder if os.path.isabs(folder) else tempfile.gettempdir()
+    try:
+        yield
+    finally:
+        del os.environ["HOME"]
 
 
 ENGINE = os.environ.get("EDSLAM_ENGINE") or DEFAULT

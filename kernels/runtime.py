@@ -7,7 +7,8 @@ import os
 import numpy as np
 import torch
 
-from edslam_ti.kernels.engine import ENGINE, ti
+from edslam_ti.kernels import compiled_cache
+from edslam_ti.kernels.engine import ENGINE, ti, with_home
 
 CHUNK = 512  # Taichi's CPU backend never splits a loop into pieces smaller than this
 
@@ -36,15 +37,16 @@ def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:
     if debug is None and ENGINE != "taichi":  # Taichi reads the variable itself
         debug = os.environ.get("TI_DEBUG", "0") not in ("", "0")
     checks = {} if debug is None else {"debug": debug}
-    ti.init(
-        arch=ti.cuda if arch == "cuda" else ti.cpu,
-        default_fp=ti.f64 if precision == "f64" else ti.f32,
-        cpu_max_num_threads=threads,
-        fast_math=False,
-        offline_cache=True,
-        log_level=ti.ERROR,
-        **checks,
-    )
+    with compiled_cache.opened(ti) as kept, with_home():
+        ti.init(
+            arch=ti.cuda if arch == "cuda" else ti.cpu,
+            default_fp=ti.f64 if precision == "f64" else ti.f32,
+            cpu_max_num_threads=threads,
+            fast_math=False,
+            log_level=ti.ERROR,
+            **kept,
+            **checks,
+        )
 
 
 def is_gpu() -> bool:

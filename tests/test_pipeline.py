@@ -35,7 +35,7 @@ from edslam_ti.trajectory import read_tum
 ROOT = Path(__file__).parents[1]
 FEW = {"iterations": 1, "final_iterations": 10}
 ARTEFACTS = {
-    *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "trajectory.png"),
+    *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "poses.csv", "trajectory.png"),
     *("map.ply", "mesh.ply", "points.ply", "flythrough.mp4"),
     *("config.yaml", "metrics.json", "log.txt", "renders"),
 }
@@ -68,7 +68,10 @@ NAMES = [
         "num_lost_frames",
         "num_keyframes",
     ),
-    *("num_gaussians", "num_events", "num_mapping_steps", "num_hot_pixels", "contrast_threshold"),
+    *("num_gaussians", "num_events", "num_mapping_steps", "num_hot_pixels"),
+    *("sigma_position_median_cm", "sigma_position_end_cm", "sigma_rotation_median_deg"),
+    *("depth_delay_ms", "depth_delay_sigma_ms", "event_depth_disagreement", "lost_share", "problems"),
+    *("num_dropped_events", "data_notes", "contrast_threshold"),
     *("contrast_threshold_source", "contrast_threshold_positive", "contrast_threshold_negative"),
     *("contrast_threshold_deviation", "tracking_hz", "tracking_s", "mapping_s", "refinement_s", "device"),
     *("version", "is_interrupted", "protocol", "protocols", "seconds_per_frame", "wall_s", "total_fps"),

@@ -20,7 +20,7 @@ class SimulateOptions(SimulationConfig):
     """What to record; the recording's own settings besides."""
 
     out: Path
-    """Folder that receives the recording (replaced when it exists)."""
+    """New or empty folder that receives the recording; an older recording there is replaced."""
     scene: str | None = None
     """Built-in room (room0, room2, office0, office2, office3) or wall, corridor, kitchen, ..."""
     mesh: Path | None = None
@@ -52,14 +52,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Simulate a recording."""
     options = read_options(SimulateOptions, argv, "edslam simulate", __doc__)
     load_kernels()
+    from rich.markup import escape
     from rich.progress import Progress
 
+    from edslam_ti.errors import plain
     from edslam_ti.simulation.catalogue import ROOM_NAMES
     from edslam_ti.simulation.command import Placement, record
 
     start, scale = options.trajectory_start, options.trajectory_scale
     with Progress(transient=True) as bar:
-        task = bar.add_task(f"simulating {options.mesh.name if options.mesh else options.scene}", total=1.0)
+        what = plain(options.mesh.name if options.mesh else str(options.scene))
+        task = bar.add_task(f"simulating {escape(what)}", total=1.0)
         written = record(
             scene_name=options.scene,
             mesh=options.mesh,
@@ -72,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             progress=lambda share: bar.update(task, completed=share),
         )
     print(
-        f"{written.folder}: {written.duration:g} s, {written.num_events} events, "
+        f"{plain(written.folder, 4096)}: {written.duration:g} s, {written.num_events} events, "
         f"{written.num_depth_images} depth images, {written.num_images} images"
     )
     if options.scene in ROOM_NAMES:

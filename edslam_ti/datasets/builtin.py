@@ -4,8 +4,9 @@ import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
+from edslam_ti.cache import cached
 from edslam_ti.datasets.event_replica import EventReplicaSequence
-from edslam_ti.datasets.files import cache_folder
+from edslam_ti.leftovers import remove_leftovers
 from edslam_ti.simulation import ROOM_NAMES, SimulationConfig, make_path, make_room, simulate
 from edslam_ti.simulation.truth import write_evaluation_truth
 
@@ -41,11 +42,13 @@ def builtin_sequence_folder(
     settings = config or SimulationConfig()
     key = f"{GENERATOR_VERSION} {settings.model_dump_json(exclude=_unchanged(settings))}"
     version = hashlib.sha256(key.encode()).hexdigest()[:12]
-    folder = cache_folder() / "sequences" / version / scene
+    folder = cached(Path("sequences") / version / scene)
     if (folder / "novel_views").is_dir():  # folders appear whole or not at all
         return folder
     from rich.progress import Progress
 
+    for other in folder.parent.parent.glob("*"):
+        remove_leftovers(other)  # a killed process leaves up to a gigabyte
     room = make_room(scene)
     path = make_path(room, settings)
     if folder.is_dir():  # simulated before recordings held views beside the path

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edslam_ti.cache import cache_folder
 from edslam_ti.datasets.event_checks import BadRows, EventChecker, recognised_columns, sorted_by_time
 from edslam_ti.datasets.event_copy import (
     BYTES_PER_EVENT,
@@ -19,7 +20,6 @@ from edslam_ti.datasets.event_copy import (
 )
 from edslam_ti.datasets.event_rows import BLOCK, NpyRows
 from edslam_ti.datasets.event_text import TextRows
-from edslam_ti.datasets.files import cache_folder
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 

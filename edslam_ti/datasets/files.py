@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import platformdirs
 
 from edslam_ti.camera import LARGEST_SIDE, Camera
 from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
@@ -19,11 +18,6 @@ LARGEST_NUMBER = 10**16  # in a file name: microseconds since 1970 are 2e15
 LARGEST_IMAGE = 1_000_000_000  # bytes of a file
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 STDERR = 2  # file descriptor
-
-
-def cache_folder() -> Path:
-    """Return where generated and converted data is kept; the environment's EDSLAM_CACHE moves it."""
-    return Path(os.environ.get("EDSLAM_CACHE") or platformdirs.user_cache_dir("edslam_ti"))
 
 
 def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, columns] float64

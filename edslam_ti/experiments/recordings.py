@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from edslam_ti.cache import cached
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.datasets.builtin import builtin_sequence_folder
 from edslam_ti.datasets.event_replica import EventReplicaSequence
-from edslam_ti.datasets.files import cache_folder
 from edslam_ti.datasets.rpg import RpgSequence
 from edslam_ti.experiments.cases import MESH_SCENE, REAL_SCENE, Recording
 from edslam_ti.simulation import RecordedPath, load_mesh, look_at, simulate
@@ -71,7 +71,7 @@ class Recordings:
         settings = recording.settings
         key = f"{settings.model_dump_json()} {start} {PATH_SCALE} {MESH_SCALE} {MESH_POSITION} {MESH_TARGET}"
         version = hashlib.sha256(key.encode()).hexdigest()[:12]
-        folder = cache_folder() / "sequences" / version / MESH_SCENE
+        folder = cached(Path("sequences") / version / MESH_SCENE)
         if not folder.is_dir():
             first = look_at(MESH_POSITION, MESH_TARGET, np.array([0.0, 0.0, 1.0]))
             motion = RecordedPath(read_tum(path), PATH_SCALE, first, start)

@@ -5,16 +5,17 @@ Replica's carry their light in the colours. Axes are the file's (glTF: y up; man
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from edslam_ti.errors import DataError
-from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.mesh_reading import MeshPart, read_model
+from edslam_ti.simulation.mesh_textures import check_glb_textures, check_obj_textures
 from edslam_ti.simulation.scene import NO_LIGHT, Scene, Texture
 
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, as OpenCV converts colour to grey
 READER_DEFAULT = 0.6  # base colour that Open3D's obj reader (Assimp) reports where a material has no Kd
+SMALLEST, LARGEST = 1e-3, 1e6  # metres
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".off", ".stl")
 
 
@@ -27,20 +28,22 @@ def load_mesh(path: Path, scale: float = 1.0) -> Scene:
     if not (np.isfinite(scale) and scale > 0):
         raise DataError(f"mesh scale: expected a positive factor, got {scale:g}")
     if path.suffix.lower() == ".obj":
-        _check_obj_textures(path)
-    parts = _read_parts(path)
-    if not parts:
-        raise DataError(
-            f"{path}: Open3D found no triangles in it; is it a mesh (not a point cloud) and whole?"
-        )
+        check_obj_textures(path)
+    elif path.suffix.lower() in (".glb", ".gltf"):
+        check_glb_textures(path)
+    parts = [_Part(path, part) for part in read_model(path)]
     if not any(part.coloured for part in parts):
         raise DataError(
             f"{path}: expected a texture or vertex colours, found neither; "
             "export the mesh with its texture image (obj + mtl + png, glb) or with vertex colours (ply)"
         )
     vertices = np.concatenate([part.vertices for part in parts]) * scale
-    if not np.isfinite(vertices).all():
-        raise DataError(f"{path}: vertices hold values that are not finite; repair the mesh")
+    extent = float(np.ptp(vertices, axis=0).max())
+    if not SMALLEST <= extent <= LARGEST or np.abs(vertices).max() > LARGEST:
+        raise DataError(
+            f"{path}: expected a scene of {SMALLEST:g} to {LARGEST:g} m, not {extent:g} m that reaches "
+            f"to {np.abs(vertices).max():g} m; check its scale"
+        )
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
     textures: list[Texture] = []
     texture_ids = []
@@ -65,47 +68,37 @@ def load_mesh(path: Path, scale: float = 1.0) -> Scene:
     )
 
 
-def _read_parts(path: Path) -> list["_Part"]:
-    """Return the non-empty meshes of a file."""
-    o3d = load_open3d()
-    if path.suffix.lower() in (".ply", ".off", ".stl"):  # no materials; polygons (Replica's quads) are cut up
-        mesh = o3d.io.read_triangle_mesh(str(path))
-        return [_Part(path, mesh, None)] if len(mesh.triangles) else []
-    model = o3d.io.read_triangle_model(str(path))
-    return [
-        _Part(path, m.mesh, model.materials[m.material_idx]) for m in model.meshes if len(m.mesh.triangles)
-    ]
-
-
 class _Part:
     """One mesh of a model with its material (None: no material)."""
 
-    def __init__(self, path: Path, mesh: Any, material: Any) -> None:
-        self.vertices = np.asarray(mesh.vertices)
-        self.triangles = np.asarray(mesh.triangles)
+    def __init__(self, path: Path, part: MeshPart) -> None:
+        self.vertices, self.triangles = part.vertices, part.triangles
         count = len(self.triangles)
-        image = None if material is None else material.albedo_img
         self.image = None
         self.coordinates = np.zeros((count, 3, 2))
         self.tints = np.ones((count, 3))
         self.coloured = False
-        if image is not None and not image.is_empty():
-            if not mesh.has_triangle_uvs():
+        if part.texture is not None:
+            if part.texture_coordinates is None:
                 raise DataError(f"{path}: has a texture image but no texture coordinates; export it with UVs")
-            self.image = _grey(np.asarray(image))
+            self.image = _grey(part.texture)
             height, width = self.image.shape
-            uv = np.asarray(mesh.triangle_uvs).reshape(count, 3, 2)
+            uv = part.texture_coordinates
+            if not np.isfinite(uv).all():
+                raise DataError(f"{path}: texture coordinates hold values that are not finite")
             # v points up in files (Open3D turns glTF's, which points down).
             self.coordinates = np.stack([uv[..., 0] * width, (1 - uv[..., 1]) * height], -1)
             self.coloured = True
-        if mesh.has_vertex_colors():
-            self.tints = (np.asarray(mesh.vertex_colors) @ LUMA)[self.triangles]
+        if part.colours is not None:
+            self.tints = (part.colours @ LUMA)[self.triangles]
             self.coloured = True
-        if material is not None:
-            base = np.array(material.base_color, np.float64)[:3]
+        if part.base_colour is not None:
+            base = part.base_colour
             if path.suffix.lower() == ".obj" and self.coloured and np.allclose(base, READER_DEFAULT):
                 base = np.ones(3)  # the material library gave no Kd
             self.tints = self.tints * (base @ LUMA)
+        if not np.isfinite(self.tints).all():
+            raise DataError(f"{path}: its colours hold values that are not finite")
 
 
 def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] float32 in [0, 1]
@@ -115,27 +108,3 @@ def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] float32 in [0, 1]
     if values.ndim == 3:
         values = values[..., :3] @ LUMA if values.shape[2] >= 3 else values[..., 0]
     return np.ascontiguousarray(np.clip(values, 0, 1), np.float32)
-
-
-def _check_obj_textures(path: Path) -> None:
-    """Raise when a material library or a texture that an obj names is missing: Open3D only warns."""
-    libraries = _values(path, "mtllib")
-    for library in libraries:
-        file = path.parent / library
-        if not file.is_file():
-            raise DataError(f"{path}: its material library '{library}' is missing; put it beside the mesh")
-        for texture in _values(file, "map_Kd"):
-            name = texture.split()[-1] if texture.startswith("-") else texture
-            if not (path.parent / name.replace("\\", "/")).is_file():
-                raise DataError(f"{file}: its texture '{name}' is missing; put it beside the mesh")
-
-
-def _values(path: Path, keyword: str) -> list[str]:
-    """Return what follows a keyword at the start of a line."""
-    found = []
-    with path.open(errors="replace") as file:
-        for line in file:
-            words = line.strip().split(maxsplit=1)
-            if len(words) == 2 and words[0] == keyword:
-                found.append(words[1])
-    return found

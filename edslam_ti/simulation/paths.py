@@ -22,6 +22,7 @@ BURST_INTERVAL = (1.7, 2.6)  # seconds from one fast stretch to the next
 
 
 GO, STOP = 1.0, 0.6  # seconds of motion and of rest on a stop-and-go path
+FARTHEST = 1e6  # metres; float32 holds positions to 6 cm there
 TURN_DURATION = 30.0  # seconds of a loop path for about one turn
 
 
@@ -237,12 +238,18 @@ class RecordedPath:
                 f"trajectory: expected more than {start:g} s of motion, got {length:g} s; "
                 "use a longer trajectory or another start"
             )
-        if scale <= 0:
+        if not 0 < scale < np.inf:
             raise DataError(f"trajectory scale: expected a positive factor, got {scale:g}")
         origin = trajectory.at(stamps[0] + start)
         motion = np.linalg.inv(origin) @ trajectory.poses  # [F, 4, 4]
         motion[:, :3, 3] *= scale
         placed = (origin if first_pose is None else first_pose) @ motion
+        farthest = np.abs(placed[:, :3, 3]).max()
+        if not farthest <= FARTHEST:
+            raise DataError(
+                f"trajectory: expected positions within {FARTHEST:g} m, got one {farthest:g} m "
+                "away; check its scale"
+            )
         self._trajectory = Trajectory(stamps - stamps[0] - start, placed)
         self.duration = float(stamps[-1] - stamps[0] - start)
 

@@ -9,7 +9,7 @@ novel_views/, surfaces.ply      for evaluation only, see truth.py
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -20,7 +20,7 @@ import numpy as np
 from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
-from edslam_ti.output import atomic_folder, write_npy_header
+from edslam_ti.output import atomic_folder, check_replaceable, write_npy_header
 from edslam_ti.simulation.depth_noise import kinect_depth
 from edslam_ti.simulation.paths import CameraPath
 from edslam_ti.simulation.renderer import Render, Renderer
@@ -29,6 +29,9 @@ from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_truth
 
 MILLISECOND = 1_000_000  # nanoseconds
+TITLE = "Simulated recording"  # how README.txt begins
+FILES = ("README.txt", "camera.json", "poses_ts.txt", "traj.txt", "surfaces.ply")
+PICTURES = ("images", "depth", "novel_views/images", "novel_views/depth")
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,9 @@ def simulate(
     out: Path,
     progress: Callable[[float], None] | None = None,
 ) -> RecordingSummary:
-    """Write the recording to the folder `out`, replacing it; Taichi must have been started.
+    """Write the recording to the folder `out`; Taichi must have been started.
 
+    `out` is a new or an empty folder, or an older simulated recording, which is replaced.
     Frames are rendered so that nothing moves more than `config.max_motion` pixels between two of them,
     and at every image and depth time. `progress` receives the share done, 0 to 1.
     """
@@ -66,9 +70,10 @@ def simulate(
             "use a longer duration or trajectory, or higher rates"
         )
     end = round(duration * 1e9)
+    check_replaceable(out, why_not_a_recording)
     renderer = Renderer(scene, config.camera, config.samples_per_pixel)
     times = _FrameTimes(config, path, sorted({*image_times, *depth_times, end}))
-    with atomic_folder(out) as folder:
+    with atomic_folder(out, why_not_a_recording) as folder:
         for name in ("images", "depth"):
             (folder / name).mkdir()
         threshold = folder / f"event_threshold_{config.contrast_threshold:g}"
@@ -106,6 +111,8 @@ def simulate(
                 if progress:
                     progress(now / end)
             images.finish()
+        if events.count == 0:
+            raise DataError(f"recording of {duration:g} s: no event fired; {_why_no_event(render)}")
         pose_times = image_times
         if config.pose_rate is not None:
             pose_times = _millisecond_times(config.pose_rate, duration)
@@ -113,6 +120,46 @@ def simulate(
         _write_descriptions(folder, scene, config)
         write_evaluation_truth(folder, scene, config.camera, config.samples_per_pixel, path.pose, end / 1e9)
     return RecordingSummary(out, events.count, num_frames, len(image_times), len(depth_times), duration)
+
+
+def _why_no_event(render: Render) -> str:
+    """Return what the last view tells about a recording without events."""
+    if not render.depth.any():
+        return "the camera sees no surface; check where it is put, and the scales of mesh and trajectory"
+    if render.grey.std() < 0.01:
+        return "what the camera sees is of one brightness; check the texture and where it looks"
+    return "brightness changes by less than the contrast threshold; use a longer or faster motion"
+
+
+def why_not_a_recording(folder: Path) -> str | None:
+    """Return what shows that a folder is not, or not only, a simulated recording; None: it is one."""
+    try:
+        with (folder / "README.txt").open("rb") as file:
+            title = file.read(len(TITLE)).decode(errors="replace")
+    except OSError:
+        title = ""
+    if title != TITLE:
+        return "holds something else than a simulated recording"
+    for path in _entries(folder):
+        name = path.relative_to(folder).as_posix()
+        parent = path.parent.relative_to(folder).as_posix()
+        is_known = (
+            name in (*FILES, "novel_views/traj.txt")
+            or (parent in PICTURES and path.match("frame*.png"))
+            or path.match("event_threshold_*/gray_events_data.npy")
+        )
+        if not is_known or not path.is_file() or path.is_symlink():
+            return f"holds '{name}' beside a simulated recording"
+    return None
+
+
+def _entries(folder: Path) -> Iterator[Path]:
+    """Yield all files and links below a folder."""
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            yield from _entries(path)
+        else:
+            yield path
 
 
 def _log_intensity(render: Render, config: SimulationConfig) -> np.ndarray:  # [H, W] float32
@@ -306,7 +353,7 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
     (folder / "camera.json").write_text(json.dumps(values, indent=2) + "\n")
     settings = "\n".join(f"  {key}: {value}" for key, value in config.model_dump().items())
     (folder / "README.txt").write_text(
-        f"Simulated recording: {scene.description}.\n\n"
+        f"{TITLE}: {scene.description}.\n\n"
         "poses_ts.txt, traj.txt: seconds and camera-to-world pose (16 numbers, row-major; x right, y down,\n"
         "z forward). images/: 8-bit grey. depth/: uint16, "
         f"{DEPTH_UNITS_PER_METRE} units per metre, 0 = missing.\n"

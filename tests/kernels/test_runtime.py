@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from edslam_ti import kernels
-from edslam_ti.kernels.engine import ENGINE, ti
+from edslam_ti.kernels.engine import ti
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +68,6 @@ def test_a_process_leaves_its_compiled_kernels_to_the_next_one(tmp_path: Path) -
         "from edslam_ti import kernels; from edslam_ti.kernels.time_surface import compile_kernels; "
         "kernels.init(); compile_kernels()"
     )
-    variable = "TI_OFFLINE_CACHE_FILE_PATH" if ENGINE == "taichi" else "QD_OFFLINE_CACHE_FILE_PATH"
-    environment = os.environ | {variable: str(tmp_path)}
+    environment = os.environ | {"EDSLAM_CACHE": str(tmp_path)}
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
     assert [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".lock"]
