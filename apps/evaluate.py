@@ -1,66 +1,10 @@
 """python apps/evaluate.py EST.txt TRUTH.txt [--mesh MESH.ply --recording DIR]
 
-Print the absolute and relative pose errors of a trajectory, both files in TUM format (t tx ty tz qx qy qz qw,
-seconds and metres): the numbers of evo_ape and evo_rpe. The truth is interpolated at the estimate's times.
-With --mesh and --recording also the accuracy and completion of a mesh against the true surfaces that the
-camera of a simulated recording (apps/simulate.py) saw at the estimate's times.
+Print a trajectory's errors: `edslam evaluate` from a checkout; --help lists the options.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated
-
-import tyro
-
-from edslam_ti.command_line import UsageError, launch, parse_arguments
-
-
-def evaluate(
-    estimate: Annotated[Path, tyro.conf.Positional],
-    truth: Annotated[Path, tyro.conf.Positional],
-    mesh: Path | None = None,
-    recording: Path | None = None,
-) -> None:
-    """Compare two trajectories, and a mesh with the true surfaces.
-
-    Args:
-        estimate: estimated trajectory, TUM format
-        truth: true trajectory, TUM format
-        mesh: mesh made with the estimated trajectory, in its frame
-        recording: folder of the simulated recording it was made from
-    """
-    if (mesh is None) != (recording is None):
-        raise UsageError("--mesh and --recording: expected both or neither; give the missing one")
-    from edslam_ti.evaluation.images import statistics, trajectory_errors
-    from edslam_ti.trajectory import read_tum
-
-    errors = trajectory_errors(read_tum(estimate), read_tum(truth))
-    print(f"{errors.num_poses} poses compared over {errors.timestamps[-1] - errors.timestamps[0]:.3f} s")
-    tables = {
-        "APE w.r.t. translation part (m)\n(with SE(3) Umeyama alignment)": errors.errors_cm / 100,
-        "APE w.r.t. translation part (m)\n(with Sim(3) Umeyama alignment)": errors.errors_sim3_cm / 100,
-        "RPE w.r.t. translation part (m)\nfor delta = 1 (frames)": errors.motion_errors_cm / 100,
-        "RPE w.r.t. rotation angle in degrees (deg)\nfor delta = 1 (frames)": errors.motion_errors_deg,
-    }
-    for title, values in tables.items():
-        print(f"\n{title}\n")
-        for name, value in statistics(values).items():
-            print(f"{name:>10}\t{value:.6f}")
-    print(f"\nSim(3) scale {errors.scale:.6f}; ATE rmse {errors.ate_rmse_cm:.3f} cm")
-    if mesh is not None and recording is not None:
-        from edslam_ti.datasets.event_replica import EventReplicaSequence
-        from edslam_ti.evaluation.meshes import mesh_errors, read_triangles
-
-        surface = mesh_errors(read_triangles(mesh), EventReplicaSequence(recording), read_tum(estimate))
-        print(
-            f"mesh accuracy {surface.accuracy_cm:.3f} cm, completion {surface.completion_cm:.3f} cm, "
-            f"{100 * surface.completion_ratio:.2f} % within 5 cm"
-        )
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    parse_arguments(evaluate, argv, description=__doc__)
-
+from edslam_ti.command_line import launch
+from edslam_ti.commands.evaluate import main
 
 if __name__ == "__main__":
     launch(main)

@@ -1,12 +1,43 @@
-"""ED-SLAM in Taichi: camera trajectory and 3D Gaussian map from an event stream and depth images."""
+"""ED-SLAM in Taichi: camera trajectory and 3D Gaussian map from an event stream and depth images.
 
-import os
+The public names load on demand: `import edslam_ti` loads neither torch nor Taichi.
 
-# A spinning OpenMP/OpenBLAS team after a torch or numpy call steals a core from the Taichi workers.
-# These are read once, when the libraries load, so they are set before anything imports them.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("GOMP_SPINCOUNT", "0")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+    config = edslam_ti.Config(scene="office0", duration=0.6)
+    folder = edslam_ti.run(config)                                # what `edslam slam` does
+    gaussians = edslam_ti.load_map(folder / "map.ply")            # a GaussianMap
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from edslam_ti.config import Config
+    from edslam_ti.datasets import open_sequence
+    from edslam_ti.mapping.gaussians import GaussianMap
+    from edslam_ti.pipeline import run
+    from edslam_ti.results.maps import load_map
+    from edslam_ti.slam import Slam
 
 __version__ = "0.1.0"
+
+__all__ = ["Config", "GaussianMap", "Slam", "__version__", "load_map", "open_sequence", "run"]
+
+_HOMES = {
+    "Config": "config",
+    "GaussianMap": "mapping.gaussians",
+    "Slam": "slam",
+    "load_map": "results.maps",
+    "open_sequence": "datasets",
+    "run": "pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first asked for (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

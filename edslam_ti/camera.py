@@ -6,6 +6,8 @@ import numpy as np
 
 from edslam_ti.errors import DataError
 
+NEAREST = 0.05  # metres: what is nearer than this does not count as in view
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -58,4 +60,38 @@ class Camera:
     def rays(self) -> np.ndarray:  # [H, W, 3]
         """Return the viewing ray of every pixel, scaled to z = 1 (point = depth * ray)."""
         v, u = np.mgrid[0 : self.height, 0 : self.width].astype(np.float64)
-        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], -1)
+        return self.back_project_pixels(u, v, np.ones_like(u))
+
+    def project(
+        self,
+        points: np.ndarray,  # [..., 3] metres, camera frame
+        nearest: float = 1e-6,  # metres
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # [...] each
+        """Return where points are seen, u and v in pixels, and their depths z in metres.
+
+        Nothing is cut off: pixels may lie outside the image, and points at a depth below `nearest`, also
+        those behind the camera, are divided by `nearest` instead of their depth. Callers select by z.
+        """
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        divisor = np.maximum(z, nearest)
+        return self.fx * x / divisor + self.cx, self.fy * y / divisor + self.cy, z
+
+    def back_project(
+        self,
+        depth: np.ndarray,  # [H, W] metres
+        mask: np.ndarray | None = None,  # [H, W] bool; None: where there is depth
+    ) -> np.ndarray:  # [N, 3] metres, camera frame
+        """Return the points that the pixels of a depth image see, row by row."""
+        if depth.shape != self.shape:
+            raise DataError(f"depth: expected shape {self.shape}, got {depth.shape}")
+        v, u = np.nonzero(depth > 0 if mask is None else mask)
+        return self.back_project_pixels(u, v, depth[v, u])
+
+    def back_project_pixels(
+        self,
+        u: np.ndarray,  # [...] pixels, fractions allowed
+        v: np.ndarray,  # [...] pixels
+        depth: np.ndarray,  # [...] metres
+    ) -> np.ndarray:  # [..., 3] metres, camera frame
+        """Return the points that are seen at pixels (u, v) at these depths."""
+        return np.stack([(u - self.cx) / self.fx * depth, (v - self.cy) / self.fy * depth, depth], -1)

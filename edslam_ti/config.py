@@ -1,7 +1,8 @@
 """Every setting, one validated model per stage: default, unit and source beside each field.
 
 Files and flags state differences only; a key that is unknown, or a value out of range, is an error
-that names the field.
+that names the field. A field that was renamed keeps its old name for files and flags:
+`new: int = Field(3, validation_alias=AliasChoices("new", "old"))`.
 """
 
 import difflib
@@ -9,15 +10,26 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
-from edslam_ti.errors import ConfigError
+from edslam_ti.errors import ConfigError, EdSlamError
+
+CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: what a data set needs
 
 
 class Stage(BaseModel):
-    """Base of every stage's settings: immutable, no unknown keys."""
+    """Base of every stage's settings, and of every command's options: immutable, no unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @classmethod
+    def validated(cls, values: dict[str, Any], source: str) -> Self:
+        """Return settings of these (nested) values; a ConfigError names the source and the wrong field."""
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise ConfigError(f"{source}: {_first_problem(cls, error)}") from error
 
 
 class TimeSurfaceConfig(Stage):
@@ -114,14 +126,15 @@ class TrackingConfig(Stage):
 
 
 class KeyframeConfig(Stage):
-    """When an event chunk becomes a keyframe, and what it keeps (Sec. III-E)."""
+    """When a frame becomes a keyframe, and how many frames are the newest (Sec. III-E)."""
 
     min_covisibility: float = Field(0.85, gt=0, lt=1)
     """A frame sharing a smaller fraction of visible Gaussians with the last keyframe becomes one."""
     max_translation: float = Field(0.05, gt=0)
     """Also beyond this translation relative to the median depth (MonoGS: 0.02 to 0.04)."""
     num_chunks: int = Field(5, ge=1)
-    """N: event chunks stored with a keyframe."""
+    """N: so many newest frames (event chunks) get half of the optimisation steps after each frame; all kept
+    frames share the other half."""
 
 
 class MappingConfig(Stage):
@@ -132,7 +145,7 @@ class MappingConfig(Stage):
     iterations: int = Field(5, ge=0)
     """Optimisation steps after each frame."""
     final_iterations: int = Field(400, ge=0)
-    """Steps over all keyframes after the last frame."""
+    """Steps over all kept frames after the last frame."""
     budget: float | None = Field(None, gt=0)
     """Seconds of mapping per second of data, steps left out to keep to it (results then depend on the
     machine's speed); taking in depth and solving brightness are never left out. Omitted: no limit."""
@@ -163,11 +176,12 @@ class MappingConfig(Stage):
     """Seconds over which such an image integrates, centred on its time; omitted: the data set's own
     (camera.json), else 0: images are sharp."""
     event_weight: float = Field(1.0, ge=0)
-    """lambda_event of Eq. 16 (paper: 0.7)."""
+    """lambda_event of Eq. 16 (paper: 0.7). It weighs the mean square of the differences of log brightness
+    divided by 0.1 (BRIGHTNESS_VARIANCE in mapping/losses.py): at 1 the mean square itself weighs 10."""
     depth_weight: float = Field(2.0, ge=0)
-    """lambda_d of Eq. 16 (paper: 0.05)."""
+    """lambda_d of Eq. 16 (paper: 0.05). It weighs the mean absolute depth error in metres (Eq. 15)."""
     scale_weight: float = Field(0.01, ge=0)
-    """lambda_reg of Eq. 16 (paper: 0.25)."""
+    """lambda_reg of Eq. 16 (paper: 0.25). It weighs the mean excess of Eq. 14."""
     max_scale_ratio: float = Field(10.0, ge=1)
     """r of Eq. 14: Gaussians may be this much longer than thick."""
     densify: bool = False
@@ -222,11 +236,12 @@ class Config(Stage):
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
     dataset: str | None = None
-    """Input format; omitted: EventReplica when found under the data folder, else the built-in room."""
+    """Input format: event_replica, rpg, rgbd, builtin; omitted: found by the files under the data
+    folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
     method: str = "ed_slam"
-    """What runs: ed_slam, ed_slam_paper (Eq. 5 to the letter), open3d_rgbd, open3d_icp, kiss_icp."""
+    """What runs: a pair of a tracker and a mapper."""
     start: float = Field(0.0, ge=0)
     """Seconds of the sequence to skip."""
     duration: float | None = Field(None, gt=0)
@@ -244,7 +259,8 @@ class Config(Stage):
     visualize: bool = False
     """Follow the run in an Open3D window."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the kernels run."""
+    """Where the kernels run. A run refuses cuda: rendering and tracking are not right there yet; the kernels
+    alone and the benchmark can use it."""
     threads: int = Field(2, ge=1)
     """CPU threads of the kernels; results are identical for the same number."""
     seed: int = Field(0, ge=0)
@@ -257,14 +273,16 @@ class Config(Stage):
 
     def updated(self, differences: dict[str, Any]) -> Self:
         """Return these settings with (nested) differences applied and validated."""
-        return type(self)._validated(merged(self.model_dump(), differences), source="settings")
+        differences = with_present_names(type(self), differences)
+        return self.validated(merged(self.model_dump(), differences), source="settings")
 
-    @classmethod
-    def _validated(cls, values: dict[str, Any], source: str) -> Self:
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise ConfigError(f"{source}: {_first_problem(cls, error)}") from error
+    def require_device(self) -> None:
+        """Raise EdSlamError where a run on the device would give wrong results."""
+        if self.device == "cuda":
+            raise EdSlamError(
+                "device: rendering and tracking are not right on cuda yet; use --device cpu "
+                "(the kernels and `edslam benchmark` can be run on cuda)"
+            )
 
     def to_yaml(self) -> str:
         """Return every value as YAML, loadable with --config."""
@@ -281,8 +299,33 @@ def read_differences(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping 'key: value', got {type(values).__name__}")
-    Config._validated(merged(Config().model_dump(), values), source=str(path))
+    values = with_present_names(Config, values)
+    Config.validated(merged(Config().model_dump(), values), source=str(path))
     return values
+
+
+def dataset_differences(dataset: str, folder: Path = CONFIGS) -> dict[str, Any]:
+    """Return what a data set's own file changes; most need none."""
+    path = folder / f"{dataset}.yaml"
+    return read_differences(path) if path.is_file() else {}
+
+
+def former_names(field: FieldInfo) -> list[str]:
+    """Return the names that a field had before."""
+    alias = field.validation_alias
+    return [str(name) for name in alias.choices[1:]] if isinstance(alias, AliasChoices) else []
+
+
+def with_present_names(model: type[BaseModel], values: dict[str, Any]) -> dict[str, Any]:
+    """Return (nested) values with the present names of fields that are given by former ones."""
+    present = {old: name for name, field in model.model_fields.items() for old in former_names(field)}
+    result = {}
+    for key, value in values.items():
+        name = present.get(key, key)
+        stage: Any = model.model_fields[name].annotation if name in model.model_fields else None
+        is_stage = isinstance(stage, type) and issubclass(stage, BaseModel) and isinstance(value, dict)
+        result[name] = with_present_names(stage, value) if is_stage else value
+    return result
 
 
 def merged(base: dict[str, Any], differences: dict[str, Any]) -> dict[str, Any]:

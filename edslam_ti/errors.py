@@ -28,3 +28,7 @@ class ConfigError(EdSlamError):
 
 class DataError(EdSlamError):
     """A file is missing, unreadable, truncated, or holds values that cannot be right."""
+
+
+class MissingExtraError(EdSlamError, ModuleNotFoundError):
+    """An optional package is not installed; the message names the extra that brings it."""

@@ -1,5 +1,6 @@
 """A slice of an event stream as four parallel arrays."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,14 @@ class Events:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __getitem__(self, kept: slice | np.ndarray) -> "Events":
+        """Return the events of a slice (views), or of indices or a mask in order of time (copies)."""
+        return Events(self.x[kept], self.y[kept], self.t[kept], self.polarity[kept])
+
+    def pieces(self, length: int) -> Iterator["Events"]:
+        """Yield the events in pieces of at most `length`, so that what is made of them is small."""
+        return (self[start : start + length] for start in range(0, len(self), length))
+
     @staticmethod
     def empty() -> "Events":
         """Return a slice without events."""
@@ -32,11 +41,13 @@ class Events:
     def between(self, start: float, end: float) -> "Events":
         """Return the events with start <= t < end (views, not copies)."""
         i, j = np.searchsorted(self.t, [start, end])
-        return Events(self.x[i:j], self.y[i:j], self.t[i:j], self.polarity[i:j])
+        return self[i:j]
 
     @staticmethod
     def concatenate(parts: list["Events"]) -> "Events":
         """Return consecutive slices as one."""
         if not parts:
             return Events.empty()
+        if len(parts) == 1:
+            return parts[0]
         return Events(*(np.concatenate([getattr(p, f) for p in parts]) for f in ("x", "y", "t", "polarity")))

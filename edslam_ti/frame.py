@@ -1,5 +1,6 @@
-"""A sample as tracking and mapping see it, and how its images are reduced."""
+"""A sample as tracking and mapping see it, its events counted once for both."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,28 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import Sample
 from edslam_ti.events import Events
+from edslam_ti.kernels.time_surface import count_events
+
+EVENTS_AT_ONCE = 1_000_000  # whose pixels are held in memory
+
+
+class EventCounts:
+    """Events pixel by pixel; arrays are shared, do not change them."""
+
+    def __init__(self, events: Events, shape: tuple[int, int]) -> None:  # (H, W)
+        self.numbers = np.zeros((*shape, 2), np.int32)  # [H, W, 2] of negative and positive events
+        self.last = np.zeros(shape, np.int8)  # [H, W] polarity of the last event, 0 where there was none
+        count_events(events.x, events.y, events.polarity, self.numbers, self.last)
+        self._events = events
+
+    @functools.cached_property
+    def first(self) -> np.ndarray:  # [H, W] int8
+        """Polarity of the first event, 0 where there was none."""
+        first = np.zeros_like(self.last)
+        for events in reversed(list(self._events.pieces(EVENTS_AT_ONCE))):
+            pixel = events.y.astype(np.int64) * first.shape[1] + events.x
+            first.ravel()[pixel[::-1]] = events.polarity[::-1]  # of repeated pixels the last one stays
+        return first
 
 
 @dataclass(frozen=True)
@@ -21,27 +44,10 @@ class Frame:
     image: np.ndarray | None  # [H, W] float32 in [0, 1]; only RGB-D baselines look at it
     is_held_out: bool = False  # kept from mapping, for evaluation
 
-
-def downscaled(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
-    """Return the means of 2x2 blocks; odd edges are cut off."""
-    a, b, c, d = _corners(image)
-    mean: np.ndarray = image.dtype.type(0.25) * (a + b + c + d)
-    return mean
-
-
-def downscaled_depth(depth: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
-    """Return means of 2x2 blocks where all four depths exist and lie on one surface, else 0 (missing)."""
-    a, b, c, d = _corners(depth)
-    low = np.minimum(np.minimum(a, b), np.minimum(c, d))
-    high = np.maximum(np.maximum(a, b), np.maximum(c, d))
-    is_smooth = (low > 0) & (high - low < 0.05 * high)
-    return np.where(is_smooth, 0.25 * (a + b + c + d), np.float32(0))
-
-
-def _corners(image: np.ndarray) -> list[np.ndarray]:  # four [H / 2, W / 2]
-    """Return the four pixels under every pixel of the image at half size."""
-    h, w = (n // 2 for n in image.shape)
-    return [image[y : 2 * h : 2, x : 2 * w : 2] for y in (0, 1) for x in (0, 1)]
+    @functools.cached_property
+    def event_counts(self) -> EventCounts:
+        """The events of its chunk by pixel (Eq. 11), counted when first asked for."""
+        return EventCounts(self.events, self.camera.shape)
 
 
 class FrameBuilder:

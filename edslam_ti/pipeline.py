@@ -15,15 +15,17 @@ from edslam_ti import kernels
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, find_sequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation.images import ate_rmse_cm
+from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.mapping.mapper import Mapper
+from edslam_ti.memory import release_free_memory
 from edslam_ti.methods import METHODS
-from edslam_ti.results.folder import Run, save
-from edslam_ti.results.plots import StubViewer, Viewer
+from edslam_ti.results.folder import save
+from edslam_ti.results.run import Run
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import Tracker, TruePoses
+from edslam_ti.viewer import VIEWERS, Viewer
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 
@@ -33,12 +35,13 @@ def run(config: Config, console: Console | None = None) -> Path:
 
     Ctrl-C ends the loop early; what there is, is saved, then KeyboardInterrupt is raised.
     """
+    config.require_device()
     console = console or Console()
     try:
         kernels.init(config.device, threads=config.threads)
     except RuntimeError as error:  # no such device
         raise EdSlamError(str(error)) from error
-    viewer = Viewer() if config.visualize else StubViewer()
+    viewer = VIEWERS["open3d" if config.visualize else "none"]()
     state = _prepare(config)
     camera, (first, last) = state.sequence.camera, state.samples.timestamps[[0, -1]]
     state.note(f"{state.sequence.scene}: {state.sequence.description}, method {config.method}")
@@ -160,7 +163,7 @@ def _progress(console: Console) -> Progress:
     )
 
 
-def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", console: Console) -> None:
+def _process(state: Run, interrupt: _Interrupt, viewer: Viewer, console: Console) -> None:
     slam, mapper = state.slam, state.slam.mapper
     with _progress(console) as bar:
         task = bar.add_task("mapping" if mapper else "tracking", total=len(state.samples), status="")
@@ -169,6 +172,8 @@ def _process(state: Run, interrupt: _Interrupt, viewer: "Viewer | StubViewer", c
             if interrupt.requested:
                 break
             result = slam.process(sample, is_held_out=k in state.held_out)
+            if mapper is not None:
+                release_free_memory()  # arrays of ever other sizes come and go while mapping
             state.num_events += len(sample.events)
             if not result.converged:
                 state.note(f"frame {k} at {sample.timestamp:.3f} s lost: {result.message}")

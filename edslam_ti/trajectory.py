@@ -27,8 +27,6 @@ class Trajectory:
         if np.any(np.diff(self._timestamps) <= 0):
             raise DataError("trajectory: expected strictly increasing time stamps; sort or deduplicate them")
 
-        self._overwritten: dict[int, np.ndarray] = {}  # poses before, since `take_corrections` was called
-
     def __len__(self) -> int:
         return len(self._poses)
 
@@ -53,14 +51,7 @@ class Trajectory:
 
     def replace(self, index: int, T_world_camera: np.ndarray) -> None:
         """Overwrite one pose (loop closure, bundle adjustment)."""
-        self._overwritten.setdefault(index, self._poses[index])
         self._poses[index] = np.array(T_world_camera, np.float64)
-
-    def take_corrections(self) -> dict[int, np.ndarray]:  # [4, 4] by index
-        """Return by what poses have been moved since the last call: T_new T_old^-1."""
-        moved = {k: self._poses[k] @ np.linalg.inv(T) for k, T in self._overwritten.items()}
-        self._overwritten = {}
-        return moved
 
     def covers(self, timestamp: float, tolerance: float = 1e-6) -> bool:
         """Return whether `at` would interpolate, not extrapolate."""

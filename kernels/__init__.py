@@ -1,19 +1,17 @@
 """Taichi kernels of ED-SLAM and their torch wrappers; knows arrays, not SLAM."""
 
-import atexit
-import gc
+from typing import TYPE_CHECKING, Any
 
-# Python would look 380 times for garbage among what importing torch has just made, and then now and again.
-_was_enabled = gc.isenabled()
-gc.disable()
-try:
+if TYPE_CHECKING:
     from edslam_ti.kernels.runtime import init
-finally:
-    gc.freeze()
-    atexit.register(gc.unfreeze)  # Taichi saves compiled kernels when its objects are collected at the end
-    if _was_enabled:
-        gc.enable()
-
-__project__ = "edslam_ti"  # `kernels` is also the name of an unrelated PyPI package
 
 __all__ = ["init"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load `init` when it is first used: a module of constants can be imported without Taichi."""
+    if name in __all__:
+        from edslam_ti.kernels import runtime
+
+        return getattr(runtime, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,15 +19,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
-NEAR = 0.05  # metres
-OCCLUSION, OCCLUSION_MARGIN = 0.03, 0.02  # share of depth, metres: this far behind what is measured is hidden
-SAME_SURFACE = 0.03  # share of depth: within it is the surface that is measured
+# A point is occluded if it lies behind the nearest measured depth around it by more than this share of that
+# depth and this margin (metres). One-sided and lenient: nearer points and missing depth count as seen.
+OCCLUDED, OCCLUDED_MARGIN = 0.03, 0.02
+# A point lies on the measured surface if all depths around it differ from its own by less than this share.
+# Two-sided and strict, for `is_strict`: neither nearer points nor missing depth are accepted.
+SAME_SURFACE = 0.03
 BORDER = 1.001  # pixels; all four corners are in the image
 CONVERGED = 1e-14  # of the squared residual, preconditioned, at the start
 NO_DEPTH = -1.0  # of all pixels of an image without depth, where any surface counts as seen
@@ -92,7 +96,7 @@ def _find_rows(
                                 measured = depths[corners_[c]]
                                 nearest = ti.select((measured > 0) & (measured < nearest), measured, nearest)
                                 seen += weights[c] * changes[corners_[c]]
-                            is_seen = z <= nearest * (1 + OCCLUSION) + OCCLUSION_MARGIN
+                            is_seen = z <= nearest * (1 + OCCLUDED) + OCCLUDED_MARGIN
                             if is_strict > 0:
                                 for c in ti.static(range(4)):
                                     measured = depths[corners_[c]]

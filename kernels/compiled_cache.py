@@ -185,7 +185,7 @@ class CompiledKernels:
 
 def _checksums(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of every file; raise ValueError where there is something else."""
-    sums = {}
+    sums: dict[str, str] = {}
     for entry in os.scandir(folder):
         if entry.is_dir(follow_symlinks=False):
             inner = _checksums(Path(entry.path))

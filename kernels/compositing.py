@@ -4,8 +4,7 @@
 single pixel (kernels.rasterization_gpu); the maths is in kernels.rasterization.
 """
 
-import taichi as ti
-
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, SUMS, exp, largest, sums_of
 from edslam_ti.kernels.projection import (
     BLOCK,

@@ -2,10 +2,10 @@
 
 import math
 
-import taichi as ti
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA, NEAR
 from edslam_ti.kernels.runtime import check_shape, plain
 

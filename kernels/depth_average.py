@@ -4,14 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.patch_warp import Patches
 from edslam_ti.kernels.runtime import check_shape
-
-NEAR = 0.05  # metres
 
 
 @vector_instructions

@@ -18,8 +18,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import check_shape
 
 MIN_THRESHOLD = 0.01  # ESIM's lower bound of a noisy threshold

@@ -9,30 +9,37 @@ does not: write the latter in inner loops.
 """
 
 import functools
+import threading
 from collections.abc import Callable
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import float_dtype
 
 LANES = 16
 SUMS = 8  # of lanes, made at once
+_configuration = threading.RLock()  # of the engine's settings
 
 
 def vector_instructions(kernel: Callable) -> Callable:
-    """Return the kernel, compiled with fast_math and, on a CPU, so that vectors stay whole."""
+    """Return the kernel, compiled with fast_math and, on a CPU, so that vectors stay whole.
+
+    Both are settings of the whole engine, changed for the time of a launch. A lock keeps two threads from
+    launching such kernels at once; other kernels must not be launched from another thread meanwhile.
+    """
 
     @functools.wraps(kernel)
     def launch(*arguments: object) -> None:
-        ti.cfg.real_matrix_scalarize = ti.cfg.arch == ti.cuda
-        ti.cfg.fast_math = True
-        try:
-            kernel(*arguments)
-        finally:
-            ti.cfg.real_matrix_scalarize = True
-            ti.cfg.fast_math = False
+        with _configuration:
+            ti.cfg.real_matrix_scalarize = ti.cfg.arch == ti.cuda
+            ti.cfg.fast_math = True
+            try:
+                kernel(*arguments)
+            finally:
+                ti.cfg.real_matrix_scalarize = True
+                ti.cfg.fast_math = False
 
     return launch
 

@@ -24,15 +24,15 @@ pixel by pixel.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
 PART = 32  # blocks of LANES pixels to a partial sum: a fixed partition, the same bits for any threads
 PARTS_PER_WORKER = 24  # fewer are done before another core has woken up
-NEAR = 0.05  # metres
 # Columns of a partial sum: 21 entries of H (upper triangle, row by row), 6 of g, then
 COST, NUM_SURFACE, NUM_DEPTH, NUM_USABLE = 27, 28, 29, 30
 SUM_SIZE = 31
@@ -41,34 +41,39 @@ FX, FY, CX, CY, MAX_DEPTH_DIFFERENCE, SURFACE_SIGMA = 12, 13, 14, 15, 16, 17
 DEPTH_WEIGHT, DEPTH_SIGMA, DEPTH_SIGMA_2, HUBER_THRESHOLD = 18, 19, 20, 21
 JOB_SIZE = 22
 POINT_SIZE = 4  # X, Y, Z, value; then, in the compositional form, both residuals' Jacobians
-MAX_SLOPE = 0.05  # share of depth a pixel: more is an edge, whose depth says nothing about the surface
+# Share of the depth by which neighbouring pixels of one depth image may differ: more is an edge, and what is
+# interpolated across it lies on no surface. It compares measurements of one image; SAME_SURFACE and OCCLUDED
+# of kernels.brightness_image compare a predicted depth with measured ones.
+MAX_SLOPE = 0.05
 
 
 @ti.func
-def bilinear(image: ti.template(), x, y):
-    """Value at (x, y), all four corners inside."""
-    i, j = ti.cast(ti.floor(y), ti.i32), ti.cast(ti.floor(x), ti.i32)
-    fx, fy = x - j, y - i
-    a, b = image[i, j], image[i, j + 1]
-    c, d = image[i + 1, j], image[i + 1, j + 1]
-    top, bottom = a + fx * (b - a), c + fx * (d - c)
-    return top + fy * (bottom - top)
+def warp(T, X, Y, Z, fx, fy, cx, cy):
+    """Eq. 3: p' = T p of view b (metres), 1 / p'_z, and its pixel x', y'; not visible if p'_z <= NEAR.
+
+    T are the twelve numbers of T_b_a by rows, p = (X, Y, Z) is pi^-1 of a patch pixel of view a.
+    """
+    p_x = T[0] * X + T[1] * Y + T[2] * Z + T[3]
+    p_y = T[4] * X + T[5] * Y + T[6] * Z + T[7]
+    p_z = T[8] * X + T[9] * Y + T[10] * Z + T[11]
+    inv_z = 1.0 / ti.max(p_z, NEAR)
+    return p_x, p_y, p_z, inv_z, fx * p_x * inv_z + cx, fy * p_y * inv_z + cy
 
 
 @ti.func
-def is_inside(x, y, height, width):
-    return x >= 0 and x < width - 1 and y >= 0 and y < height - 1
+def sample_bilinear(corner, u, v):
+    """Eq. 4: value and gradient at fractions (u, v) between the corners a b / c d of a square pixel."""
+    a, b, c, d = corner[0], corner[1], corner[2], corner[3]
+    top, bottom = a + u * (b - a), c + u * (d - c)
+    along_x = (b - a) + v * ((d - c) - (b - a))
+    return top + v * (bottom - top), along_x, bottom - top
 
 
 @ti.func
-def transform(T: ti.template(), p):
-    return ti.Vector(
-        [
-            T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3],
-            T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3],
-            T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3],
-        ]
-    )
+def lowest_and_highest(corner):
+    """The smallest and the largest of four corners."""
+    a, b, c, d = corner[0], corner[1], corner[2], corner[3]
+    return ti.min(ti.min(a, b), ti.min(c, d)), ti.max(ti.max(a, b), ti.max(c, d))
 
 
 @ti.kernel
@@ -93,56 +98,12 @@ def _extract_patches(
                 pixels[m, 2] = 1.0 / depth[y, x]
 
 
-@ti.kernel
-def _warp_pixels(
-    pixels: ti.types.ndarray(ndim=2),  # [M, 3] x, y, inverse depth (0 = none)
-    T_b_a: ti.types.ndarray(ndim=2),  # [4, 4]
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    warped: ti.types.ndarray(ndim=2),  # out [M, 3] x', y', depth in b (0 = not visible)
-):
-    for m in range(pixels.shape[0]):
-        warped[m, 0], warped[m, 1], warped[m, 2] = 0.0, 0.0, 0.0
-        if pixels[m, 2] > 0:
-            z = 1.0 / pixels[m, 2]
-            p = transform(T_b_a, ti.Vector([(pixels[m, 0] - cx) / fx * z, (pixels[m, 1] - cy) / fy * z, z]))
-            if p[2] > NEAR:
-                warped[m, 0], warped[m, 1] = fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy
-                warped[m, 2] = p[2]
-
-
-@ti.kernel
-def _sample_bilinear(
-    image: ti.types.ndarray(ndim=2),  # [H, W]
-    points: ti.types.ndarray(ndim=2),  # [M, 2 or more] x, y, ...
-    values: ti.types.ndarray(ndim=1),  # out [M]
-    inside: ti.types.ndarray(ti.u8, ndim=1),  # out [M]
-):
-    for m in range(points.shape[0]):
-        values[m], inside[m] = 0.0, ti.cast(0, ti.u8)
-        if is_inside(points[m, 0], points[m, 1], image.shape[0], image.shape[1]):
-            values[m], inside[m] = bilinear(image, points[m, 0], points[m, 1]), ti.cast(1, ti.u8)
-
-
 @ti.func
 def huber(r, threshold):
     """Huber weight and cost of normalised residuals."""
     size = ti.max(r, 0.0 - r)
     cut = ti.min(size, threshold)
     return cut / ti.max(size, 1e-12), cut * (size - 0.5 * cut)
-
-
-@ti.func
-def interpolate(corner, u, v):
-    """Values and gradients at fractions (u, v) between corners a b / c d, and the corners' extremes."""
-    a, b, c, d = corner[0], corner[1], corner[2], corner[3]
-    top, bottom = a + u * (b - a), c + u * (d - c)
-    along_x = (b - a) + v * ((d - c) - (b - a))
-    lowest = ti.min(ti.min(a, b), ti.min(c, d))
-    highest = ti.max(ti.max(a, b), ti.max(c, d))
-    return top + v * (bottom - top), along_x, bottom - top, lowest, highest
 
 
 @vector_instructions
@@ -174,11 +135,7 @@ def _linearise(
                 total = [zeros() for _ in range(SUM_SIZE)]
                 for block in range(parts[part, 0], parts[part, 1]):
                     X, Y, Z, value = points[block, 0], points[block, 1], points[block, 2], points[block, 3]
-                    p_x = T[0] * X + T[1] * Y + T[2] * Z + T[3]
-                    p_y = T[4] * X + T[5] * Y + T[6] * Z + T[7]
-                    p_z = T[8] * X + T[9] * Y + T[10] * Z + T[11]
-                    inv_z = 1.0 / ti.max(p_z, NEAR)
-                    x, y = fx * p_x * inv_z + cx, fy * p_y * inv_z + cy
+                    p_x, p_y, p_z, inv_z, x, y = warp(T, X, Y, Z, fx, fy, cx, cy)
                     is_usable = Z > 0
                     inside = is_usable & (p_z > NEAR)
                     inside = inside & (x >= 0) & (x < last_column) & (y >= 0) & (y < last_row)
@@ -194,8 +151,9 @@ def _linearise(
                             surface_corners[k][lane] = images[place[k]]
                             depth_corners[k][lane] = images[place[k] + 1]
                     u, v = x - column, y - row
-                    s, s_x, s_y, _, _ = interpolate(surface_corners, u, v)
-                    d, d_x, d_y, d_low, d_high = interpolate(depth_corners, u, v)
+                    s, s_x, s_y = sample_bilinear(surface_corners, u, v)
+                    d, d_x, d_y = sample_bilinear(depth_corners, u, v)
+                    d_low, d_high = lowest_and_highest(depth_corners)
                     has_depth = d_low > NEAR
                     r_depth = p_z - d
                     # tau_d: the depth check of Sec. III-B; without depth in b there is nothing to check.
@@ -308,7 +266,7 @@ class ResidualModel:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """H xi = -g for the twist xi that updates T_b_a <- exp(xi) T_b_a, and what went into it."""
+    """H xi = -g for a twist xi, and what went into it."""
 
     H: np.ndarray  # [6, 6] float64
     g: np.ndarray  # [6] float64
@@ -350,29 +308,6 @@ def extract_patches(
     return Patches(pixels, values)
 
 
-def warp_pixels(
-    pixels: np.ndarray,  # [M, 3] x, y, inverse depth (0 = none)
-    T_b_a: np.ndarray,  # [4, 4]
-    intrinsics: tuple[float, float, float, float],
-) -> np.ndarray:  # [M, 3] x', y', depth in view b (0 = not visible)
-    """Return patch pixels of view a as seen in view b, Eq. 3."""
-    check_shape("pixels", pixels, (None, 3))
-    check_shape("T_b_a", T_b_a, (4, 4))
-    warped = np.empty_like(pixels)
-    _warp_pixels(pixels, np.ascontiguousarray(T_b_a, pixels.dtype), *intrinsics, warped)
-    return warped
-
-
-def sample_bilinear(
-    image: np.ndarray,  # [H, W] float
-    points: np.ndarray,  # [M, >= 2] float: x, y
-) -> tuple[np.ndarray, np.ndarray]:  # [M] values, [M] bool: inside
-    """Return the image at sub-pixel points by bilinear interpolation (Eq. 4); 0 outside."""
-    values, inside = np.empty(len(points), image.dtype), np.empty(len(points), np.uint8)
-    _sample_bilinear(image, np.ascontiguousarray(points), values, inside)
-    return values, inside.astype(bool)
-
-
 @dataclass(frozen=True)
 class Direction:
     """Patches of one view that are aligned to the image of another."""
@@ -383,7 +318,11 @@ class Direction:
 
 
 class Alignment:
-    """Normal equations of several directions at once, for poses that change from call to call."""
+    """Normal equations of several directions at once, for poses that change from call to call.
+
+    Their unknown is the twist xi with T_b_a <- exp(xi) T_b_a. If the points carry the Jacobians of a template
+    (`is_compositional`), it is the xi with T_b_a <- T_b_a exp(xi).
+    """
 
     def __init__(
         self,
@@ -392,18 +331,18 @@ class Alignment:
         intrinsics: tuple[float, float, float, float],
     ) -> None:
         check_shape("views", views, (None, None, None, 2))
-        self._views = np.ascontiguousarray(views, _numpy_float())
+        self._views: np.ndarray = np.ascontiguousarray(views, _numpy_float())
         points = [direction.points.numpy() for direction in directions]
         rows = points[0].shape[1] if points else POINT_SIZE
-        self._is_compositional = rows > POINT_SIZE
+        self.is_compositional = rows > POINT_SIZE
         if len(directions) == 1:
             self._points = directions[0].points
         else:
             self._points = torch.empty(sum(map(len, points)), rows, LANES, dtype=float_dtype())
             np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
-        self._jobs = np.empty((len(directions), JOB_SIZE), _numpy_float())
+        self._jobs: np.ndarray = np.empty((len(directions), JOB_SIZE), _numpy_float())
         self._parts: list[slice] = []
-        bounds = []
+        bounds: list[tuple[int, int, int, int]] = []
         begin = 0
         for job, direction in enumerate(directions):
             if not 0 <= direction.view < len(views):
@@ -418,10 +357,10 @@ class Alignment:
                 model.depth_weight, model.depth_sigma, model.depth_sigma_2, model.huber_threshold,
             )  # fmt: skip
         self._bounds = np.array(bounds, np.int32).reshape(-1, 4)
-        self._sums = np.empty((len(bounds), SUM_SIZE), _numpy_float())
+        self._sums: np.ndarray = np.empty((len(bounds), SUM_SIZE), _numpy_float())
 
     def linearise(self, poses: list[np.ndarray]) -> "list[NormalEquations]":  # T_b_a [4, 4] of each direction
-        """Return the Gauss-Newton system of Eq. 5 for each direction."""
+        """Return the Gauss-Newton system of Eq. 5 for each direction, in the unknown that the class names."""
         for job, T_b_a in enumerate(poses):
             self._jobs[job, :FX] = T_b_a[:3].ravel()
         if len(self._bounds):
@@ -429,56 +368,25 @@ class Alignment:
             num_workers = min(workers(), 1 + len(self._bounds) // PARTS_PER_WORKER)
             _linearise(
                 self._points, self._views.reshape(-1), height, width, self._bounds, self._jobs,
-                num_workers, self._sums, self._is_compositional,
+                num_workers, self._sums, self.is_compositional,
             )  # fmt: skip
         totals = [self._sums[parts].sum(0, dtype=np.float64) for parts in self._parts]
-        systems = [
+        return [
             NormalEquations(
                 total[_SYMMETRIC], total[21:COST], float(total[COST]),
                 int(total[NUM_SURFACE]), int(total[NUM_DEPTH]), int(total[NUM_USABLE]),
             )
             for total in totals
         ]  # fmt: skip
-        if self._is_compositional:  # exp(xi) T = T exp(Ad(T^-1) xi)
-            systems = [s.transformed(np.linalg.inv(adjoint(T))) for s, T in zip(systems, poses)]
-        return systems
-
-
-def normal_equations(
-    patches: Patches,  # of view a
-    surface: np.ndarray,  # [H, W] of view b
-    depth: np.ndarray,  # [H, W] of view b, metres, 0 = missing
-    T_b_a: np.ndarray,  # [4, 4]
-    intrinsics: tuple[float, float, float, float],
-    model: ResidualModel,
-    inverse: bool = False,
-) -> NormalEquations:
-    """Return the Gauss-Newton system of Eq. 5, one direction: patches of view a against view b.
-
-    `inverse`: the unknown updates T_a_b <- exp(xi) T_a_b, to be added to the forward direction's.
-    """
-    check_shape("depth", depth, surface.shape)
-    check_shape("T_b_a", T_b_a, (4, 4))
-    direction = Direction(patches.points(intrinsics), 0, model)
-    (system,) = Alignment([direction], np.stack([surface, depth], -1)[None], intrinsics).linearise([T_b_a])
-    # T_b_a exp(-xi) = exp(-Ad(T_b_a) xi) T_b_a
-    return system.transformed(-adjoint(T_b_a)) if inverse else system
 
 
 def compile_kernels() -> None:
     """Compile what tracking needs, so that the first frames of a sequence need not wait for it."""
-    image = np.zeros((2, 2), _numpy_float())
+    image: np.ndarray = np.zeros((2, 2), _numpy_float())
     patches = extract_patches(image, image, np.zeros((1, 2), np.int32), 1)
-    normal_equations(patches, image, image, np.eye(4), (1.0, 1.0, 0.0, 0.0), ResidualModel())
-
-
-def adjoint(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6, 6]
-    """Return Ad(T) for twists (translation, rotation): T exp(xi) = exp(Ad(T) xi) T."""
-    R, (x, y, z) = T[:3, :3], T[:3, 3]
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
-    return result
+    intrinsics = (1.0, 1.0, 0.0, 0.0)
+    direction = Direction(patches.points(intrinsics), 0, ResidualModel())
+    Alignment([direction], np.zeros((1, 2, 2, 2)), intrinsics).linearise([np.eye(4)])
 
 
 def _numpy_float() -> type:

@@ -17,10 +17,11 @@ on a GPU the same functions work on one Gaussian per thread.
 
 from dataclasses import dataclass
 
-import taichi as ti
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import (
     LANES,
     SUMS,
@@ -33,7 +34,6 @@ from edslam_ti.kernels.lanes import (
 )
 from edslam_ti.kernels.runtime import CHUNK, float_dtype, plain, workers
 
-NEAR = 0.05  # metres; nearer Gaussians are culled
 LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian ends where its alpha falls below this
 NOT_DRAWN = -1  # in place of the depth bits, which are positive
@@ -125,6 +125,38 @@ def first_and_last(low, high, size):
     """The first and last pixel in [low, high], of a row or column of `size`; first > last: none."""
     first, last = ti.ceil(low - SLACK), ti.floor(high + SLACK)
     return ti.select(first > 0.0, first, 0.0), ti.select(last < size - 1.0, last, size - 1.0)
+
+
+@ti.func
+def is_near_image(x, y, width, height):
+    """Whether a mean is near enough to the image for the affine approximation of Eq. 7."""
+    return (
+        (x > -MARGIN * width) & (x < (1 + MARGIN) * width)
+        & (y > -MARGIN * height) & (y < (1 + MARGIN) * height)
+    )  # fmt: skip
+
+
+@ti.func
+def reached_columns(a, b, x, slope, p, q, r, extent, width, is_drawn):
+    """First * HALF + last column of blocks that ellipses reach between heights a and b above their means.
+
+    The ellipse is p dx^2 + q dx dy + r dy^2 = extent around the column x. Its rightmost point is at the
+    height `slope`, its leftmost at -slope: between a and b, the outermost ones are at the nearest heights.
+    """
+    low, high = (0.0 - slope), slope
+    low = ti.select(low < a, a, low)
+    low = ti.select(low > b, b, low)
+    high = ti.select(high < a, a, high)
+    high = ti.select(high > b, b, high)
+    root_low = q * q * low * low - 4.0 * p * (r * low * low - extent)
+    root_high = q * q * high * high - 4.0 * p * (r * high * high - extent)
+    inverse = 0.5 / ti.select(is_drawn, p, 1.0)
+    reach_low = (ti.sqrt(ti.select(root_low > 0.0, root_low, 0.0)) + q * low) * inverse
+    reach_high = (ti.sqrt(ti.select(root_high > 0.0, root_high, 0.0)) - q * high) * inverse
+    begin, end = first_and_last(x - reach_low, x + reach_high, width)
+    is_reached = is_drawn & (begin <= end)
+    begin = ti.select(is_reached, ti.floor(begin / BLOCK), 1.0)
+    return begin * HALF + ti.select(is_reached, ti.floor(end / BLOCK), 0.0)
 
 
 @ti.func
@@ -266,6 +298,7 @@ def _project_forward(
     first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [V * padded + 1] of every Gaussian, one slot a tile
     C: ti.template(),
 ):
+    """Project LANES Gaussians at a time into all views, and count the tiles that each of them touches."""
     groups = gaussians.shape[1]
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
@@ -284,11 +317,8 @@ def _project_forward(
                         gaussians, group, poses, v, fx, fy, cx, cy, low_pass
                     )
                     det = cov_xx * cov_yy - cov_xy * cov_xy
-                    is_near_image = (
-                        (mean_x > -MARGIN * width) & (mean_x < (1 + MARGIN) * width)
-                        & (mean_y > -MARGIN * height) & (mean_y < (1 + MARGIN) * height)
-                    )  # fmt: skip
-                    is_seen = (z > NEAR) & is_near_image & (extent > 0.0) & (det > 0.0)
+                    is_near = is_near_image(mean_x, mean_y, width, height)
+                    is_seen = (z > NEAR) & is_near & (extent > 0.0) & (det > 0.0)
                     x, y = ti.select(is_seen, mean_x, 0.0), ti.select(is_seen, mean_y, 0.0)
                     half_width = ti.sqrt(ti.select(is_seen, 2.0 * extent * cov_xx, 0.0))
                     half_height = ti.sqrt(ti.select(is_seen, 2.0 * extent * cov_yy, 0.0))
@@ -301,31 +331,14 @@ def _project_forward(
                     half = ti.select(is_drawn, 0.5 / det, 0.0)
                     p, q, r = once(cov_yy * half), once((0.0 - 2.0) * cov_xy * half), once(cov_xx * half)
                     first = (v * groups + group) * LANES
-                    # Of each row of blocks the ellipse reaches only some. Its rightmost point is at (w, s):
-                    # between rows a and b, it is the rightmost one at the height nearest to s, and
-                    # p x^2 + q x y + r y^2 = extent.
+                    # Of each row of blocks the ellipse reaches only some.
                     slope = half_width * cov_xy / ti.select(is_drawn, cov_xx, 1.0)
                     for row in range(ti.min(SPANS, ti.cast(largest(rows), ti.i32))):
                         a = (top + row) * BLOCK - y
                         b = a + (BLOCK - 1.0)
                         a = ti.select(a > 0.0 - half_height, a, 0.0 - half_height)
                         b = ti.select(b < half_height, b, half_height)
-                        low, high = (0.0 - slope), slope
-                        low = ti.select(low < a, a, low)
-                        low = ti.select(low > b, b, low)
-                        high = ti.select(high < a, a, high)
-                        high = ti.select(high > b, b, high)
-                        root_low = q * q * low * low - 4.0 * p * (r * low * low - extent)
-                        root_high = q * q * high * high - 4.0 * p * (r * high * high - extent)
-                        inverse = 0.5 / ti.select(is_drawn, p, 1.0)
-                        reach_low = (ti.sqrt(ti.select(root_low > 0.0, root_low, 0.0)) + q * low) * inverse
-                        reach_high = (
-                            ti.sqrt(ti.select(root_high > 0.0, root_high, 0.0)) - q * high
-                        ) * inverse
-                        begin, end = first_and_last(x - reach_low, x + reach_high, width)
-                        is_reached = is_drawn & (begin <= end)
-                        begin = ti.select(is_reached, ti.floor(begin / BLOCK), 1.0)
-                        columns = begin * HALF + ti.select(is_reached, ti.floor(end / BLOCK), 0.0)
+                        columns = reached_columns(a, b, x, slope, p, q, r, extent, width, is_drawn)
                         for lane in ti.static(range(LANES)):
                             if rows[lane] > row:
                                 record[first + lane, ti.static(gradient_size(C)) + SPAN + row] = columns[lane]

@@ -18,7 +18,6 @@ Eq. 8's depth is a sum weighted by alpha; divide by alpha for an expected depth.
 
 from dataclasses import dataclass
 
-import taichi as ti
 import torch
 from torch import Tensor
 
@@ -32,6 +31,7 @@ from edslam_ti.kernels.compositing import (
     lane_rows,
     list_blocks,
 )
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, integer_lanes, lanes, sums, vector_instructions
 from edslam_ti.kernels.projection import (
     BLOCK,

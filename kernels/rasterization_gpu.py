@@ -6,11 +6,11 @@ atomically, so that sums may differ in their last bits from run to run. Sorting 
 on the device; the number of (Gaussian, tile) pairs is read back once a view, to allocate their lists.
 """
 
-import taichi as ti
 import torch
 from torch import Tensor
 
 from edslam_ti.kernels.compositing import draw, draw_backward
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES
 from edslam_ti.kernels.projection import (
     BLOCK,
@@ -20,7 +20,6 @@ from edslam_ti.kernels.projection import (
     HALF_K_XX,
     HALF_K_YY,
     K_XY,
-    MARGIN,
     MEAN,
     MEAN_X,
     MEAN_Y,
@@ -35,6 +34,7 @@ from edslam_ti.kernels.projection import (
     ellipses,
     first_and_last,
     gradient_size,
+    is_near_image,
     record_size,
     unpack_tiles,
 )
@@ -71,11 +71,8 @@ def _project(
         det = cov_xx * cov_yy - cov_xy * cov_xy
         num_tiles[g] = 0
         depth_bits[g] = NOT_DRAWN
-        is_near_image = (
-            (mean_x > -MARGIN * width) & (mean_x < (1 + MARGIN) * width)
-            & (mean_y > -MARGIN * height) & (mean_y < (1 + MARGIN) * height)
-        )  # fmt: skip
-        if (z > NEAR) & is_near_image & (extent > 0.0) & (det > 0.0):
+        is_near = is_near_image(mean_x, mean_y, width, height)
+        if (z > NEAR) & is_near & (extent > 0.0) & (det > 0.0):
             half_width, half_height = ti.sqrt(2.0 * extent * cov_xx), ti.sqrt(2.0 * extent * cov_yy)
             left, right = first_and_last(mean_x - half_width, mean_x + half_width, width)
             top, bottom = first_and_last(mean_y - half_height, mean_y + half_height, height)

@@ -1,15 +1,29 @@
-"""Plain torch twins of the kernels: the specification, written for reading, compared in tests.
+"""Twins of all kernels in plain torch, or in numpy where nothing is differentiated: the specification.
 
-Everything here is differentiable by torch's autograd, which is the oracle for the hand-written
-backward passes.
+They are written for reading, and tests compare the kernels with them. What is in torch is differentiable by
+autograd, which is the oracle for the hand-written backward passes. Kernels for a CPU and for a GPU have one
+twin, as they compute the same. The twins of kernels.texture are in kernels/reference_texture.py.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.brightness_image import (
+    BORDER,
+    OCCLUDED,
+    OCCLUDED_MARGIN,
+    SAME_SURFACE,
+    ChangeImage,
+)
 from edslam_ti.kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE, VISIBLE_TRANSMITTANCE
-from edslam_ti.kernels.patch_warp import ResidualModel
-from edslam_ti.kernels.projection import LOW_PASS, MIN_ALPHA, NEAR
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.culling import REACH
+from edslam_ti.kernels.depth_average import DepthAgreement
+from edslam_ti.kernels.patch_warp import MAX_SLOPE, ResidualModel
+from edslam_ti.kernels.projection import LOW_PASS, MARGIN, MIN_ALPHA
 from edslam_ti.kernels.rasterization import Rasterization
 
 # --- time surface ---
@@ -73,7 +87,7 @@ def alignment_residuals(
     r_depth = warped[:, 2] - sample_bilinear(depth, warped)
     keep = ~has_depth | (r_depth.abs() < model.max_depth_difference)
     r_surface = (sample_bilinear(surface, warped) - values)[keep] / model.surface_sigma
-    is_smooth = corners.amax(-1) - corners.amin(-1) < 0.05 * corners.amax(-1)
+    is_smooth = corners.amax(-1) - corners.amin(-1) < MAX_SLOPE * corners.amax(-1)
     sigma = model.depth_sigma + model.depth_sigma_2 * warped[:, 2].detach() ** 2
     return r_surface, (r_depth / sigma)[keep & has_depth & is_smooth]
 
@@ -111,6 +125,11 @@ def project(
     return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariances, z
 
 
+def _is_near(position: Tensor, size: int) -> Tensor:
+    """Return whether a mean is near enough to the image for the affine approximation of Eq. 7."""
+    return (position > -MARGIN * size) & (position < (1 + MARGIN) * size)
+
+
 def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor,
     T_camera_world: Tensor, intrinsics: tuple[float, ...], size: tuple[int, int],
@@ -124,7 +143,7 @@ def rasterize(
         means[front], quats[front], scales[front], T_camera_world, intrinsics
     )
     u, v = means_2d.detach().unbind(-1)
-    near_image = (u > -0.3 * width) & (u < 1.3 * width) & (v > -0.3 * height) & (v < 1.3 * height)
+    near_image = _is_near(u, width) & _is_near(v, height)
     order = depths.detach().float().argsort(stable=True)
     order = order[near_image[order]]
     index = front[order]
@@ -150,6 +169,144 @@ def rasterize(
         visible,
         dominant.view(height, width),
     )
+
+
+def drawable(
+    means: Tensor,  # [N, 3]
+    log_scales: Tensor,  # [N, 3]
+    T_camera_world: Tensor,  # [4, 4]
+    intrinsics: tuple[float, ...],
+    size: tuple[int, int],  # (width, height)
+) -> Tensor:  # [M] indices
+    """Return the Gaussians whose largest ball may reach the image; see kernels.culling."""
+    fx, fy, cx, cy = intrinsics
+    x, y, z = (means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).unbind(-1)
+    sigma = log_scales.amax(-1).exp() / z
+    marked = z > NEAR
+    for offset, f, centre, n in ((fx * x / z, fx, cx, size[0]), (fy * y / z, fy, cy, size[1])):
+        reach = REACH * torch.sqrt((f**2 + offset**2) * sigma**2 + LOW_PASS)
+        for margin in (reach, torch.full_like(reach, MARGIN * n)):
+            marked &= (offset + centre > -1 - margin) & (offset + centre < n + margin)
+    return torch.nonzero(marked).squeeze(1)
+
+
+def compare_change(
+    starts: Rasterization, ends: Rasterization, measured: Tensor, background: float, epsilon: float
+) -> Tensor:
+    """Return the squared error of the brightness change between two views, Eq. 10-12."""
+    start, end = (_intensity(view, background) + epsilon for view in (starts, ends))
+    return (torch.log(end / start) - measured).square().sum()
+
+
+def compare_view(
+    view: Rasterization, log_brightness: Tensor, depth: Tensor, background: float, epsilon: float
+) -> tuple[Tensor, Tensor]:
+    """Return the squared error of the log brightness, and the depth error weighted by alpha (Eq. 14, 15)."""
+    squares = (torch.log(_intensity(view, background) + epsilon) - log_brightness).square().sum()
+    return squares, (view.depth - view.alpha * depth).abs()[depth > 0].sum()
+
+
+def _intensity(view: Rasterization, background: float) -> Tensor:
+    return view.image[..., 0] + (1 - view.alpha) * background
+
+
+# --- images of a depth camera ---
+
+
+def average_depth(
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+    others: Sequence[np.ndarray],  # K times [H, W]
+    poses: Sequence[np.ndarray],  # K times [4, 4] T_other_camera
+    intrinsics: tuple[float, float, float, float],
+    agreement: DepthAgreement,
+) -> np.ndarray:  # [H, W]
+    """Return each pixel's depth averaged with those, along its ray, that others measured and that agree."""
+    result = depth.astype(float)
+    for v, u in np.argwhere(depth > 0):
+        own = float(depth[v, u])
+        noise = agreement.sigma + agreement.sigma_2 * own**2
+        gate = min(agreement.num_sigmas * noise, agreement.share * own)
+        ray, measured = _ray(u, v, intrinsics), [own]
+        for other, T in zip(others, poses, strict=True):
+            p, (x, y) = _seen(T, own * ray, intrinsics)
+            if p[2] < NEAR or not (0 <= x < depth.shape[1] - 1 and 0 <= y < depth.shape[0] - 1):
+                continue
+            j, i = int(x), int(y)
+            seen = float((_bilinear_weights(x, y) * other[i : i + 2, j : j + 2]).sum())
+            further = (seen - p[2]) / (T[2, :3] @ ray)
+            if abs(further) < gate:
+                measured.append(own + further)
+        result[v, u] = np.mean(measured)
+    return result
+
+
+def brightness_equations(
+    first: ChangeImage,
+    second: ChangeImage,
+    T_second_first: np.ndarray,  # [4, 4]
+    intrinsics: tuple[float, float, float, float],
+    is_strict: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:  # [N, H W], [N]
+    """Return A and b: l(u) - l(x(u)) = E_second(x(u)) - E_first(u) for every pixel u seen in both images."""
+    assert first.depth is not None
+    height, width = first.depth.shape
+    rows, changes = [], []
+    for v, u in np.argwhere(first.depth > 0):
+        p, (x, y) = _seen(T_second_first, first.depth[v, u] * _ray(u, v, intrinsics), intrinsics)
+        if not (p[2] > NEAR and 0 <= x < width - BORDER and 0 <= y < height - BORDER):
+            continue
+        around = (slice(int(y), int(y) + 2), slice(int(x), int(x) + 2))
+        if second.depth is not None:
+            measured = second.depth[around]
+            nearest = np.where(measured > 0, measured, np.inf).min()
+            if p[2] > nearest * (1 + OCCLUDED) + OCCLUDED_MARGIN:
+                continue
+            if is_strict and (np.abs(measured - p[2]) >= SAME_SURFACE * p[2]).any():
+                continue
+        weights, row = _bilinear_weights(x, y), np.zeros((height, width))
+        row[v, u] = 0 if first.is_known else 1
+        if not second.is_known:
+            row[around] -= weights
+        rows.append(row.ravel())
+        changes.append((weights * second.change[around]).sum() - first.change[v, u])
+    return np.array(rows).reshape(-1, height * width), np.array(changes)
+
+
+def brightness_image(
+    A: np.ndarray,  # [N, H W]
+    b: np.ndarray,  # [N]
+    prior: np.ndarray,  # [H, W]
+    prior_weight: float,
+    huber_threshold: float,
+    is_robust: Sequence[bool],  # solutions
+) -> np.ndarray:  # [H, W]
+    """Return the image that conjugate gradients approach, by solving the normal equations directly."""
+    level = prior.ravel()
+    for robust in is_robust:
+        size = np.abs(A @ level - b).clip(1e-12)
+        weight = np.minimum(1, huber_threshold / size) if robust else np.ones(len(b))
+        normal = A.T @ (weight[:, None] * A) + prior_weight * np.eye(prior.size)
+        level = np.linalg.solve(normal, A.T @ (weight * b) + prior_weight * prior.ravel())
+    return level.reshape(prior.shape)
+
+
+def _ray(u: float, v: float, intrinsics: tuple[float, float, float, float]) -> np.ndarray:  # [3]
+    fx, fy, cx, cy = intrinsics
+    return np.array([(u - cx) / fx, (v - cy) / fy, 1])
+
+
+def _seen(
+    T: np.ndarray, point: np.ndarray, intrinsics: tuple[float, float, float, float]
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """Return a moved point [3] and its pixel."""
+    fx, fy, cx, cy = intrinsics
+    p = T[:3, :3] @ point + T[:3, 3]
+    return p, (fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy)
+
+
+def _bilinear_weights(x: float, y: float) -> np.ndarray:  # [2, 2] of the corners around a point
+    right, down = x - np.floor(x), y - np.floor(y)
+    return np.outer([1 - down, down], [1 - right, right])
 
 
 # --- event simulation ---
@@ -192,7 +349,8 @@ def simulate_events(
     width = L0.shape[1]
     pixel = torch.arange(L0.numel()).view(L0.shape)
     p = torch.sign(L1 - L0)
-    base = torch.where(p > 0, *(torch.full_like(L0, c) for c in thresholds))
+    brighter, darker = thresholds
+    base = torch.where(p > 0, torch.full_like(L0, brighter), torch.full_like(L0, darker))
     level, k, last = reference.clone(), num_crossings.clone(), last_event.clone()
     events = []
     while True:

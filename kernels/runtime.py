@@ -1,46 +1,16 @@
-"""Start Taichi, and check what crosses the torch / Taichi boundary."""
+"""Start Taichi, and check what crosses the boundary between torch and Taichi."""
 
-import ast
 import contextlib
-import functools
 import io
 import os
-import textwrap
-import types
-
-from edslam_ti.kernels import compiled_cache
-
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-os.environ.setdefault("HOME", compiled_cache.home())
 
 import numpy as np
-import taichi as ti
-import taichi.lang.expr
-import taichi.lang.matrix_ops  # Taichi's first vector would import it, eight times as slowly by then
 import torch
-from taichi.lang import kernel_impl
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+from edslam_ti.kernels import compiled_cache
+from edslam_ti.kernels.engine import ENGINE, ti
 
 CHUNK = 512  # Taichi's CPU backend never splits a loop into pieces smaller than this
-
-
-def _place_in_source(self: ASTTransformerContext, node: ast.expr | ast.stmt) -> str:
-    """Say where in our source a kernel does not compile."""
-    line = node.lineno + self.lineno_offset
-    return f'File "{self.file}", line {line}, in {self.func.func.__name__}:\n{self.src[node.lineno - 1]}\n'
-
-
-# Until a kernel first runs, Taichi spent more than half the time on wording this for every expression and on
-# finding, and wrapping, the source of functions once for each of their uses; it asked numpy for the range of
-# integers at every literal, and looked through all modules to see whether a function is a method (none is).
-ASTTransformerContext.get_pos_info = _place_in_source
-kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
-kernel_impl.textwrap = types.SimpleNamespace(dedent=textwrap.dedent, fill=functools.cache(textwrap.fill))
-taichi.lang.expr.np = types.SimpleNamespace(**vars(np) | {"iinfo": functools.cache(np.iinfo)})
-kernel_impl._inside_class = lambda level_of_class_stackframe: False
-# At every launch, Taichi asked anew for each array whether torch is there and what its dtype is called.
-kernel_impl.has_pytorch = functools.cache(kernel_impl.has_pytorch)
-kernel_impl.to_taichi_type = functools.cache(kernel_impl.to_taichi_type)
 
 
 def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool | None = None) -> None:
@@ -64,6 +34,8 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
 
 
 def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:
+    if debug is None and ENGINE != "taichi":  # Taichi reads the variable itself
+        debug = os.environ.get("TI_DEBUG", "0") not in ("", "0")
     checks = {} if debug is None else {"debug": debug}
     with compiled_cache.opened(ti) as kept:
         ti.init(
@@ -78,12 +50,18 @@ def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:
 
 
 def is_gpu() -> bool:
-    """Return whether Taichi was started on a GPU."""
+    """Return whether the kernels run on a GPU."""
     return ti.cfg.arch == ti.cuda
 
 
+def synchronize() -> None:
+    """Wait until the GPU has done what kernels and torch have launched."""
+    ti.sync()
+    torch.cuda.synchronize()
+
+
 def workers() -> int:
-    """Return the number of CPU workers Taichi was started with."""
+    """Return the number of CPU threads that run kernels."""
     return int(ti.cfg.cpu_max_num_threads)
 
 

@@ -13,8 +13,8 @@ longer side, each in the mip level as coarse as its share (anisotropic filtering
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import check_shape
 
 MAX_TAPS = 4

@@ -7,10 +7,10 @@ are neighbours.
 
 from dataclasses import dataclass
 
-import taichi as ti
 import torch
 from torch import Tensor
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.projection import NOT_DRAWN, Projection, gradient_size, unpack_tiles
 from edslam_ti.kernels.runtime import CHUNK, workers
 

@@ -6,8 +6,8 @@ T(x, t) = exp(-(t - t_last(x)) / tau),    E(x) = C+ n+(x) - C- n-(x), n the even
 import functools
 
 import numpy as np
-import taichi as ti
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import CHUNK, check_shape, workers
 
 MANY_EVENTS = 500_000  # below this numpy is done before a second core has woken up

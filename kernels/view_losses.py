@@ -13,7 +13,6 @@ D - A measured = sum_i (d_i - measured) alpha_i T_i: what is transparent is no e
 
 from dataclasses import dataclass
 
-import taichi as ti
 import torch
 from torch import Tensor
 
@@ -27,6 +26,7 @@ from edslam_ti.kernels.compositing import (
     list_blocks,
     log_255_alpha,
 )
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import LANES, exp, lanes, log, sums, sums_of, vector_instructions, zeros
 from edslam_ti.kernels.projection import (
     BLOCK,
@@ -309,7 +309,7 @@ def _compare(
 
 
 def _compare_rendered(
-    gaussians: tuple[Tensor, ...], poses: Tensor,
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor], poses: Tensor,
     intrinsics: tuple[float, float, float, float], size: tuple[int, int],
     target: Tensor, target_depth: Tensor, weights: tuple[float, float],
     background: float, epsilon: float, low_pass: float,

@@ -1,44 +1,75 @@
-"""Taichi is started once for the whole session; tests that need float64 kernels restart it and back."""
+"""The engine of the kernels is started once for the whole session; float64 tests restart it and back."""
 
+from edslam_ti.cold_start import load_kernels
+
+load_kernels()  # as commands do, before anything below loads numpy or torch
+
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
-import edslam_ti  # noqa: F401  (sets the threading environment before torch loads)
 from edslam_ti import kernels
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 
-SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+# Real recordings, kept beside the project and never in it
+DATA = Path(os.environ.get("EDSLAM_DATA") or Path(__file__).parents[2] / "shared" / "data")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", choices=("cpu", "cuda"), default="cpu", help="where tests/kernels run")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark tests that need real recordings; with --device cuda only tests of kernels are run."""
+    for item in items:
+        if "shared_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("data")
+    if config.getoption("device") == "cuda":
+        if not torch.cuda.is_available():
+            pytest.exit("skipped: --device cuda, but torch finds no CUDA device", returncode=0)
+        on_device = [item for item in items if Path(__file__).parent / "kernels" in item.path.parents]
+        config.hook.pytest_deselected(items=[item for item in items if item not in on_device])
+        items[:] = on_device
+        for item in items:
+            item.add_marker("gpu")
+
+
+@pytest.fixture(scope="session")
+def device(request: pytest.FixtureRequest) -> str:
+    """Return where kernels run."""
+    chosen: str = request.config.getoption("device")
+    return chosen
 
 
 @pytest.fixture(scope="session", autouse=True)
-def taichi_cpu() -> None:
-    kernels.init("cpu", threads=2)
+def started_kernels(device: str) -> None:
+    kernels.init(device, threads=2)
     torch.set_num_threads(1)  # a few thousand numbers are done before a second thread has woken up
 
 
 @pytest.fixture
-def double_precision() -> Iterator[None]:
+def double_precision(device: str) -> Iterator[None]:
     """Run the same kernels in float64, for gradcheck."""
-    kernels.init("cpu", precision="f64", threads=2)
+    kernels.init(device, precision="f64", threads=2)
     yield
-    kernels.init("cpu", threads=2)
+    kernels.init(device, threads=2)
 
 
 @pytest.fixture
 def shared_data() -> Path:
-    """Real recordings kept beside the project, never in it."""
-    if not SHARED_DATA.is_dir():
-        pytest.skip(f"real data not found at {SHARED_DATA}")
-    return SHARED_DATA
+    """Return the folder of real recordings; EDSLAM_DATA names another than ../shared/data."""
+    if not DATA.is_dir():
+        pytest.skip(f"real data not found at {DATA}; EDSLAM_DATA names its folder")
+    return DATA
 
 
 @pytest.fixture(scope="session")
 def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of the tiny room on disk; copy it before changing anything."""
+    """Record the tiny room on disk; copy the folder before changing anything."""
     from sequences import record_tiny_room
 
     return record_tiny_room(tmp_path_factory.mktemp("recordings") / "tiny")
@@ -51,5 +82,5 @@ def tiny_sequence(tiny_folder: Path) -> EventDepthSequence:
 
 @pytest.fixture(scope="session")
 def tiny_samples(tiny_sequence: EventDepthSequence) -> list[Sample]:
-    """Its samples, 50 ms apart, each with depth, image and true pose."""
+    """Return its samples, 50 ms apart, each with depth, image and true pose."""
     return list(SampledSequence(tiny_sequence, start=0.0, duration=None, max_interval=0.1))

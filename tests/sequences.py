@@ -9,7 +9,7 @@ import numpy as np
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, Sample
-from edslam_ti.evaluation.images import trajectory_errors
+from edslam_ti.evaluation.trajectories import trajectory_errors
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.events import Events
 from edslam_ti.frame import FrameBuilder

@@ -12,9 +12,9 @@ ROOT = Path(__file__).parents[1]
 RANKS: list[list[str]] = [
     [
         *("kernels", "errors", "memory", "leftovers", "output", "cache"),
-        *("open3d_loader", "ply_check", "mesh_reading"),
+        *("open3d_loader", "ply_check", "mesh_reading", "cold_start"),
     ],
-    ["config", "geometry", "camera", "events"],
+    ["config", "arguments", "geometry", "camera", "events"],
     ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
@@ -24,6 +24,7 @@ RANKS: list[list[str]] = [
     ["methods", "results"],
     ["pipeline", "command_line"],
     ["experiments"],
+    ["commands"],
     ["apps"],
 ]
 
@@ -32,37 +33,42 @@ RANKS: list[list[str]] = [
 ORDERS: dict[str, list[str]] = {
     "ranks": [
         *("errors", "memory", "leftovers", "output", "cache"),
-        *("open3d_loader", "ply_check", "mesh_reading", "kernels"),
-        *("config", "geometry", "camera", "events"),
+        *("open3d_loader", "ply_check", "mesh_reading", "kernels", "cold_start"),
+        *("config", "arguments", "geometry", "camera", "events"),
         *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
-    "event_images": ["solve", "start_image", "contrast", "sharp"],
+    "event_images": ["change", "noisy", "solve", "contrast", "sharp"],
     "tracking": [
         *("tracker", "surfaces", "patch_tracker", "keyframes", "motion_prior", "smoothing", "gaps"),
         *("place_recognition", "pose_graph", "loop_closure", "image_tracker"),
     ],
     "mapping": [
-        *("gaussians", "rendering", "losses", "volume", "mapper", "insertion", "keyframes", "densification"),
-        *("targets", "poses", "gaussian_mapper"),
+        *("gaussian_ply", "gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion"),
+        *("keyframes", "densification", "recolouring", "targets", "poses", "gaussian_mapper"),
     ],
-    "evaluation": ["images", "meshes"],
-    "results": ["pictures", "export", "plots", "folder"],
+    "evaluation": ["trajectories", "lpips", "images", "meshes"],
+    "results": [
+        *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
+    ],
     "experiments": [
-        *("cases", "recordings", "runs", "ablations", "report", "long_stream", "kernel_times", "steps"),
-        "command",
+        *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
+        *("kernel_times", "front_end", "steps", "benchmark", "command"),
     ],
 }
 
 # Libraries that only some modules may import, besides numpy, torch and the standard library.
 LIBRARIES: dict[str, list[str]] = {
-    "taichi": ["kernels", "experiments.kernel_times"],
+    "taichi": ["kernels.engine", "kernels.taichi_speedups"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
-    "pydantic": ["config", "command_line", "simulation", "datasets"],
+    "pydantic": ["config", "arguments", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
     "scipy": ["trajectory", "simulation", "mapping", "results"],
-    "cv2": ["alignment", "datasets", "simulation", "event_images", "tracking", "mapping", "results"],
+    "cv2": [
+        *("alignment", "depth_images", "datasets", "simulation", "event_images", "tracking", "mapping"),
+        "results",
+    ],
     "OpenEXR": ["datasets"],
     "platformdirs": ["cache"],
     "evo": ["evaluation"],
@@ -71,14 +77,13 @@ LIBRARIES: dict[str, list[str]] = {
     "lpips": ["evaluation"],
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
-    "matplotlib": ["results", "experiments.steps"],
-    "rich": ["datasets", "results", "pipeline", "experiments", "apps"],
+    "matplotlib": ["results"],
+    "rich": ["datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
-    "tyro": ["command_line", "experiments", "apps"],
 }
 USES_OPEN3D = [
+    "mesh_reading",
     *(
-        "mesh_reading",
         "ray_casting",
         "simulation",
         "evaluation",
@@ -86,12 +91,12 @@ USES_OPEN3D = [
         "mapping.insertion",
         "mapping.volume",
     ),
-    *("baselines", "results"),
+    *("baselines", "results", "viewer"),
 ]
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
 HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
-APP_LINES = 100  # a longer app is not thin any more
+APP_LINES = 20  # a longer app is not thin any more
 
 
 def source_files() -> dict[str, Path]:

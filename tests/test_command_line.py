@@ -12,13 +12,19 @@ import pytest
 from pydantic import BaseModel
 from written_sequences import save_events, some_events, write_sequence
 
+from edslam_ti import __version__, pipeline
+from edslam_ti.baselines.kiss import KissIcpTracker
+from edslam_ti.camera import Camera
 from edslam_ti.command_line import launch, parse_config
+from edslam_ti.commands import run
 from edslam_ti.config import Config
+from edslam_ti.errors import EdSlamError
 from edslam_ti.methods import METHODS
 from edslam_ti.pipeline import open_recording
 
 ROOT = Path(__file__).parents[1]
 APP = ROOT / "apps" / "slam.py"
+REPRODUCE = ["tracking", "ablations", "long_stream", "report"]
 
 
 @pytest.fixture
@@ -105,6 +111,7 @@ def test_nested_switches_take_true_and_false() -> None:
         ("--seed one", 2, "--seed"),
         ("--mapping.enabled maybe", 2, "expected true or false, got 'maybe'"),
         ("--device tpu", 2, "'tpu'"),
+        ("--poses truht", 2, "--poses: expected one of tracked, truth, got 'truht'; did you mean 'truth'?"),
         ("--dataset rpg --tracking.num-patches -3", 1, "tracking.num_patches: Input should be greater"),
         ("--dataset rpg --start nan", 1, "start: "),
         ("--dataset rpg --method ed_slm", 1, "method: expected one of"),
@@ -198,6 +205,82 @@ def test_help_shows_every_stage_without_loading_torch() -> None:
     assert result.stdout.count("--config FILE") == 1
     for heavy in ("torch", "taichi", "open3d", "matplotlib"):
         assert not re.search(rf"\|\s+{heavy}$", result.stderr, re.MULTILINE)
+
+
+def test_every_command_has_help_without_loading_torch() -> None:
+    code = f"""
+import contextlib, sys
+from edslam_ti import commands
+helps = [[name, "--help"] for name in commands.COMMANDS] + [["reproduce", c, "--help"] for c in {REPRODUCE}]
+for arguments in [[], ["--version"], *helps]:
+    with contextlib.suppress(SystemExit):
+        commands.run(arguments)
+print("loaded:", *sys.modules)
+"""
+    shown, _, loaded = _run("-c", code).stdout.partition("loaded:")
+    for name in ("slam", "view", "evaluate", "simulate", "benchmark"):
+        assert f"usage: edslam {name} [-h] " in shown
+    for name in REPRODUCE:
+        assert f"usage: edslam reproduce {name} [-h] [OPTIONS]" in shown
+    assert f"edslam {__version__}" in shown.splitlines()
+    assert not {"torch", "taichi", "open3d", "matplotlib"} & set(loaded.split())
+    assert "edslam_ti.commands.simulate" in loaded.split()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *("slam --dataset builtin", "simulate --scene office0 --out x", "benchmark --suites slam"),
+        *(f"reproduce {name}" for name in REPRODUCE),
+    ],
+)
+def test_kernels_are_loaded_before_numpy_and_torch(arguments: str) -> None:
+    code = f"""
+import sys
+from edslam_ti import cold_start
+def load_kernels():
+    sys.exit(bool({{"numpy", "torch"}} & set(sys.modules)))  # they read the environment once
+cold_start.load_kernels = load_kernels
+from edslam_ti import commands
+commands.run({arguments.split()})
+"""
+    result = _run("-c", code)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_unknown_commands_are_refused_with_the_nearest_name(capsys: pytest.CaptureFixture[str]) -> None:
+    code, message = failure(capsys, lambda: run(["slm"]))
+    assert code == 2
+    assert "got 'slm'; did you mean 'slam'?" in message
+
+
+def test_a_run_on_cuda_is_refused_before_anything_loads() -> None:
+    code = """
+import sys
+from edslam_ti import commands
+sys.argv = ["edslam", "slam", "--device", "cuda"]
+try:
+    commands.main()
+finally:
+    print(*sys.modules)
+"""
+    result = _run("-c", code)
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1
+    assert "not right on cuda yet" in result.stderr
+    assert not {"torch", "taichi"} & set(result.stdout.split())
+    with pytest.raises(EdSlamError, match="not right on cuda yet"):
+        pipeline.run(Config(device="cuda"))
+
+
+def test_a_method_without_its_package_ends_in_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)  # as if it were not installed
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+    code, message = failure(capsys, lambda: KissIcpTracker(camera))
+    assert code == 1
+    assert "pip install 'edslam-ti[kiss]'" in message
 
 
 def test_bad_events_end_the_app_in_one_line_and_leave_no_results(data: Path, tmp_path: Path) -> None:

@@ -64,3 +64,18 @@ def test_pyramid_leaves_out_depth_across_an_edge_or_a_hole() -> None:
     reduced = SurfaceFrame(frame(0.1, Events.empty(), depth), surface).level(1).depth
     assert (reduced[0, 0], reduced[1, 1]) == (0, 0)
     np.testing.assert_allclose([reduced[2, 2], reduced[0, 1]], [2.01, 2.0], rtol=1e-6)
+
+
+def test_events_are_counted_by_pixel_with_the_first_and_the_last_polarity() -> None:
+    x, y = np.array([2, 2, 2, 5], np.int16), np.array([1, 1, 1, 3], np.int16)
+    counts = frame(0.1, Events(x, y, np.arange(4.0), np.array([1, -1, -1, 1], np.int8))).event_counts
+    assert counts.numbers.sum() == 4
+    assert counts.numbers[1, 2].tolist() == [2, 1]
+    assert counts.numbers[3, 5].tolist() == [0, 1]
+    assert (counts.first[1, 2], counts.last[1, 2]) == (1, -1)
+    assert (np.count_nonzero(counts.first), np.count_nonzero(counts.last)) == (2, 2)
+
+
+def test_events_of_a_frame_are_counted_once() -> None:
+    one = frame(0.1, one_event(2, 1, 0.05))
+    assert one.event_counts is one.event_counts

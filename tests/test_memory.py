@@ -15,6 +15,7 @@ def resident_mib() -> float:
     return psutil.Process().memory_info().rss / MIB
 
 
+@pytest.mark.slow  # what is resident depends on the machine
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator can be told to")
 def test_gaps_between_arrays_go_back_to_the_system() -> None:
     del_at_once = np.zeros(30 * MIB, np.uint8)  # its end makes glibc keep smaller arrays on its heap

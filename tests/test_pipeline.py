@@ -23,11 +23,11 @@ from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation import images as evaluation
+from edslam_ti.evaluation import trajectories as evaluation
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
+from edslam_ti.mapping.gaussian_ply import read_gaussian_ply
 from edslam_ti.pipeline import held_out_frames, run
 from edslam_ti.results import folder as results
-from edslam_ti.results.export import read_gaussian_ply
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import read_tum
@@ -45,6 +45,27 @@ KEYS = {
     *("num_frames", "num_lost_frames", "num_gaussians", "num_events", "tracking_hz", "total_fps"),
     *("wall_s", "peak_memory_mb", "device", "protocol"),
 }
+
+# All of metrics.json, in its order: people's scripts read it.
+NAMES = [
+    *("dataset", "scene", "description", "method", "ate_rmse_cm", "ate_mean_cm", "ate_median_cm"),
+    *("ate_max_cm", "ate_rmse_sim3_cm", "rpe_trans_cm", "rpe_rot_deg", "ate_frontend_rmse_cm"),
+    *("path_length_m", "psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "psnr_db_all"),
+    *("psnr_corrected_db_all", "ssim_corrected_all", "lpips_corrected_all", "ssim_all", "lpips_all"),
+    *("depth_l1_cm", "num_held_out_views", "psnr_mapped_db", "psnr_mapped_corrected_db"),
+    *("ssim_mapped_corrected", "lpips_mapped_corrected", "psnr_mapped_db_all"),
+    *("psnr_mapped_corrected_db_all", "ssim_mapped_corrected_all", "lpips_mapped_corrected_all"),
+    *("ssim_mapped_all", "lpips_mapped_all", "depth_l1_mapped_cm", "num_mapped_views", "psnr_novel_db"),
+    *("psnr_novel_corrected_db", "ssim_novel_corrected", "lpips_novel_corrected", "psnr_novel_db_all"),
+    *("psnr_novel_corrected_db_all", "ssim_novel_corrected_all", "lpips_novel_corrected_all"),
+    *("ssim_novel_all", "lpips_novel_all", "depth_l1_novel_cm", "num_novel_views", "mesh_accuracy_cm"),
+    *("mesh_completion_cm", "mesh_completion_ratio_5cm", "num_frames", "num_lost_frames", "num_keyframes"),
+    *("num_gaussians", "num_events", "num_mapping_steps", "num_hot_pixels", "contrast_threshold"),
+    *("contrast_threshold_source", "contrast_threshold_positive", "contrast_threshold_negative"),
+    *("contrast_threshold_deviation", "tracking_hz", "tracking_s", "mapping_s", "refinement_s", "device"),
+    *("version", "is_interrupted", "protocol", "protocols", "seconds_per_frame", "wall_s", "total_fps"),
+    "peak_memory_mb",
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -104,6 +125,7 @@ def test_latest_points_to_the_result(result: Path) -> None:
 
 def test_metrics_have_every_key_and_are_right(result: Path) -> None:
     metrics = metrics_of(result)
+    assert list(metrics) == NAMES
     assert metrics.keys() >= KEYS
     assert (metrics["dataset"], metrics["scene"], metrics["method"]) == ("event_replica", "tiny", "ed_slam")
     assert metrics["num_frames"] == 14
@@ -273,11 +295,24 @@ def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None
     assert metrics["num_gaussians"] == 0
 
 
+@pytest.mark.parametrize(("is_mapping", "expected"), [(True, 6), (False, 0)])
+def test_free_memory_is_given_back_after_every_mapped_frame(
+    is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(pipeline, "release_free_memory", lambda: calls.append(1))
+    config = config_for(tiny_folder, tmp_path, duration=0.3, mapping={"enabled": is_mapping})
+    assert metrics_of(quiet_run(config))["num_frames"] == 6
+    assert len(calls) == expected
+
+
 def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "open3d_rgbd"))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply"}  # it has no Gaussians
     metrics = metrics_of(folder)
     assert metrics["method"] == "open3d_rgbd"
+    assert list(metrics) == NAMES
+    assert metrics["num_keyframes"] is metrics["num_mapping_steps"] is metrics["num_hot_pixels"] is None
     assert metrics["ate_rmse_cm"] < 3
     assert metrics["psnr_db"] > 15  # it fuses the images themselves
 
@@ -371,7 +406,7 @@ def test_interrupt_saves_what_there_is_and_exits_130(
     interrupt_at(5, monkeypatch)
     config = config_for(tiny_folder, tmp_path)
     with pytest.raises(SystemExit) as stop:
-        launch(lambda: run(config))
+        launch(lambda: print(run(config)))
     assert stop.value.code == 130
     assert "saving what there is" in capsys.readouterr().out
     folder = (tmp_path / "event_replica/tiny/ed_slam/latest").resolve()

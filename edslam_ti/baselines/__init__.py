@@ -1,1 +1,1 @@
-"""Trackers and mappers made of other people's libraries, to compare with."""
+"""Trackers and mappers from other people's libraries, for comparison."""

@@ -1,7 +1,7 @@
 """KISS-ICP on the points of the depth images, where the package `kiss-icp` is installed.
 
-Vizzo et al. 2023, the authors' own code (pip install kiss-icp). It is made for lidars: its settings here
-are scaled to rooms, and it has no motion prior but its own, so that frames without depth are predicted.
+Vizzo et al. 2023, the authors' own code (the extra `kiss`). It is made for lidars; the settings here
+are scaled to rooms. It sees depth images only, so the poses of frames without depth are predicted.
 """
 
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.errors import MissingExtraError
 from edslam_ti.frame import Frame
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
@@ -27,7 +28,8 @@ class KissIcpTracker:
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("not installed: method kiss_icp needs pip install kiss-icp") from error
+            message = "not installed: method kiss_icp needs pip install 'edslam-ti[kiss]'"
+            raise MissingExtraError(message) from error
         config = KISSConfig()
         config.data.max_range, config.data.min_range, config.data.deskew = MAX_RANGE, MIN_RANGE, False
         config.mapping.voxel_size = VOXEL_SIZE

@@ -1,12 +1,13 @@
-"""RGB-D odometry and a TSDF volume from Open3D's own functions: a method is a pair of Tracker and Mapper.
+"""Open3D's RGB-D odometry (a tracker) and its TSDF volume (a mapper).
 
-Re-implemented here from a library, not an author's system: hybrid photometric and geometric alignment
-(Park et al. 2017) to a reference frame, and volumetric fusion (Curless and Levoy 1996). It uses no
-events but looks at images, which an event camera may not have. Method `open3d_icp` is the same with depth
-alone: point-to-plane alignment with projective association (Newcombe et al. 2011). Open3D adds up in
-parallel: two runs agree to about a micrometre, not to the last digit.
+The methods are composed of library functions; they are no author's system. `open3d_rgbd` aligns each frame
+to a reference frame by brightness and depth (Park et al. 2017) and fuses it into a volume (Curless and Levoy
+1996). It uses no events and needs images, which an event camera may not have. `open3d_icp` aligns depth
+alone: point-to-plane alignment with projective association (Newcombe et al. 2011). Open3D sums in parallel,
+so two runs agree to about a micrometre, not bit for bit.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,9 @@ from edslam_ti.trajectory import Trajectory
 MAX_DEPTH = 10.0  # metres
 VOXEL_SIZE = 0.02  # metres
 ITERATIONS = (10, 5, 3)  # coarse to fine, Open3D's default
-MIN_FITNESS = 0.3  # fraction of pixels with a partner; below, tracking has failed
-# A reference serves until the camera has moved this far. Partners are whole pixels, which hides motions
-# below one: from frame to frame the drift is several times larger.
+MIN_FITNESS = 0.3  # fraction of matched pixels below which tracking has failed
+# The reference is kept until the camera has moved this far. Open3D matches whole pixels, which hides smaller
+# motions: aligned from frame to frame, the drift is several times larger.
 REFERENCE_DISTANCE = 0.1  # metres
 REFERENCE_ANGLE = 6.0  # degrees
 
@@ -43,7 +44,7 @@ class OdometryTracker:
         self._reference: tuple[Any, np.ndarray] | None = None  # RGB-D image, T_world_camera
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; without its data it is the guess, and said to be lost."""
+        """Return the pose of `frame`; where its depth or image is missing, the guess, marked as lost."""
         needs_image = self._method != "PointToPlane"
         if frame.depth is None or (needs_image and frame.image is None):
             missing = "depth image" if frame.depth is None else "image"
@@ -85,7 +86,7 @@ class OdometryTracker:
                 criteria_list=[odometry.OdometryConvergenceCriteria(n) for n in ITERATIONS],
                 method=getattr(odometry.Method, self._method),
             )
-        except RuntimeError:  # Open3D's answer to a singular system: nothing to align
+        except RuntimeError:  # Open3D raises it for a singular system: nothing to align
             return T_guess, 0.0
         return result.transformation.numpy(), float(result.fitness)
 
@@ -138,6 +139,22 @@ class TsdfMapper:
         """Return the vertices of the fused surface [N, 3] and their brightness [N]."""
         mesh = self._volume.mesh()
         return np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors).reshape(-1, 3).mean(1)
+
+    @property
+    def map(self) -> TsdfVolume:
+        """The volume."""
+        return self._volume
+
+    def keyframe_indices(self) -> list[int]:
+        """Return nothing: every frame is fused, and none is chosen."""
+        return []
+
+    def metrics(self) -> dict[str, int | float | None]:
+        """Return nothing: the volume has no numbers of its own."""
+        return {}
+
+    def save(self, folder: Path) -> None:
+        """Write nothing: the volume's points and mesh are written for every mapper."""
 
 
 def _rgbd_image(depth: np.ndarray, image: np.ndarray) -> Any:

@@ -57,6 +57,7 @@ class EventDepthSequence(ABC):
     description: str  # one line: what this is; a stand-in says so
     surfaces_file: Path | None = None  # true surfaces of a simulated scene, a PLY mesh; for evaluation only
     has_events: bool = True
+    num_dropped_events: int = 0  # rows of the events' file that were bad and left out
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
 
     @abstractmethod

@@ -1,41 +1,46 @@
-"""Events in one `.npy` array of rows (x, y, t, p), read slice by slice however large the file is."""
+"""Events of one file, read slice by slice however large it is."""
 
-from bisect import bisect_left
-from collections.abc import Iterator
+import copy
+import logging
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from edslam_ti.cache import cache_folder
+from edslam_ti.datasets.event_checks import BadRows, EventChecker, recognised_columns, sorted_by_time
+from edslam_ti.datasets.event_copy import (
+    BYTES_PER_EVENT,
+    CopySummary,
+    EventCopy,
+    EventsInMemory,
+    MappedEvents,
+)
+from edslam_ti.datasets.event_rows import BLOCK, NpyRows
+from edslam_ti.datasets.event_text import TextRows
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 
-DISORDER = 5e-3  # s: simulators sort in blocks of 1 ms or so, not globally (gray_events_data.npy)
-LONGEST_RECORDING = 2e5  # s: a longer span means that the stamps are not in seconds
-PROBES = 32  # blocks of PROBE_LENGTH rows looked at when a file is opened
-PROBE_LENGTH = 2048
+IN_MEMORY = 2_000_000  # rows of an array that are checked anew each time; a quarter of a second
+SLOW = 50_000_000  # bytes; longer files show a bar while they are checked
+TYPICAL_LINE = 15  # bytes of a line of text with an event, to estimate how many there are
 
+logger = logging.getLogger(__name__)
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where the array lies in the file."""
-
-    dtype: np.dtype
-    shape: tuple[int, int]
-    fortran_order: bool
-    offset: int  # bytes
+Progress = Callable[[float], None]  # receives the share done, 0 to 1
 
 
 class EventFile:
-    """Rows (x, y, t, p): pixel column, pixel row, seconds, polarity in {-1, +1} or {0, 1}.
+    """Sorted events of an `.npy` array or a text, which is checked once and then read from a compact copy.
 
-    A slice maps the file afresh and copies out what it needs, so that the pages it touched leave the
-    process with it: resident memory does not grow with the file or with the number of slices. Stamps
-    may be out of order by up to `DISORDER`; slices come out sorted and exact.
+    Rows are pixel column, pixel row, seconds, polarity in {-1, +1} or {0, 1}; of a text: seconds first.
+    Bad rows are left out: `num_dropped` and `notes` tell how many and why. Stamps may be out of order by up
+    to `DISORDER`; slices come out sorted and exact.
 
-    `shift` seconds are subtracted from every stamp. `name` and `first_row` are for messages only: the
-    file the user knows and the number it gives to the first row.
+    A slice of the copy is mapped, not read into memory: 1e8 events in one slice take no memory of their own
+    unless stamps are shifted, which takes 8 bytes an event. `shift` seconds are subtracted from every stamp.
     """
 
     def __init__(
@@ -43,21 +48,27 @@ class EventFile:
         path: Path,
         width: int,
         height: int,
-        name: str | None = None,
-        first_row: int = 0,
-        shift: float = 0.0,
+        is_text: bool = False,
+        progress: Progress | None = None,
     ) -> None:
+        """`progress` follows the first reading of a large file; without it there is a bar on the terminal.
+
+        Raises `DataError` for files that hold no events, too many bad ones, or times in another unit.
+        """
         self.path = path
-        self.name = name or str(path)
-        self.first_row = first_row
-        self.shift = shift
-        self._size = (width, height)
-        self._layout = _read_layout(path, self.name)
-        self._negative: float | None = None  # what the file writes for polarity -1: -1 or 0
-        self._first, self._last = self._probe()  # s, as stored
+        self.shift = 0.0
+        size = (width, height)
+        source = TextRows(path, size) if is_text else NpyRows(path)
+        self._events, summary = _checked(source, size, progress)
+        self.num_dropped = summary.num_dropped
+        self.notes = summary.notes
+        self._num_events = summary.num_events
+        self._first, self._last = self._events.time_range  # s, as stored
+        for note in summary.notes:
+            logger.warning("%s: %s", path, note)
 
     def __len__(self) -> int:
-        return self._layout.shape[0]
+        return self._num_events
 
     @property
     def time_range(self) -> tuple[float, float]:
@@ -66,154 +77,124 @@ class EventFile:
 
     def shifted(self, shift: float) -> "EventFile":
         """Return the same events on a clock whose zero is at stamp `shift`."""
-        width, height = self._size
-        return EventFile(self.path, width, height, self.name, self.first_row, shift)
+        result = copy.copy(self)
+        result.shift = shift
+        return result
 
     def between(self, start: float, end: float) -> Events:
         """Return the events with start <= t < end, sorted by time (stable)."""
         start, end = start + self.shift, end + self.shift
         if not end > start:
             return Events.empty()
-        with self._mapped() as rows:
-            times = rows[:, 2]
-            # With every stamp within DISORDER of the running maximum, no event of [start, end) lies
-            # before the first index or behind the second.
-            i = bisect_left(times, start - DISORDER)
-            j = bisect_left(times, end + DISORDER, lo=i)
-            x, y, t, polarity = self._checked(rows, i, j)
-        in_order = bool((t[1:] >= t[:-1]).all())
-        if in_order:
-            a, b = np.searchsorted(t, [start, end])
-            kept: slice | np.ndarray = slice(int(a), int(b))
-        else:
-            kept = np.flatnonzero((t >= start) & (t < end))
-            kept = kept[np.argsort(t[kept], kind="stable")]
-        t = t[kept]
-        if self.shift:
-            t = t - self.shift
-        return Events(*(np.ascontiguousarray(a) for a in (x[kept], y[kept], t, polarity[kept])))
+        events = self._events.between(start, end)
+        return replace(events, t=events.t - self.shift) if self.shift else events
 
-    @contextmanager
-    def _mapped(self) -> Iterator[np.ndarray]:  # [N, 4]
-        """Map the file for the length of a block; whatever leaves the block must be a copy."""
-        layout = self._layout
-        if layout.shape[0] == 0:
-            yield np.empty(layout.shape, layout.dtype)
-            return
-        mapped: np.ndarray = np.memmap(
-            self.path,
-            layout.dtype,
-            mode="r",
-            offset=layout.offset,
-            shape=layout.shape,
-            order="F" if layout.fortran_order else "C",
-        )
-        yield mapped.view(np.ndarray)
 
-    def _checked(
-        self, rows: np.ndarray, i: int, j: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return x, y, t, polarity of rows i to j as copies; every value is looked at."""
-        block = rows[i:j]
-        t = block[:, 2].astype(np.float64)
-        with np.errstate(invalid="ignore"):  # NaN to int: caught by the comparison below
-            x, y = block[:, 0].astype(np.int16), block[:, 1].astype(np.int16)
-        width, height = self._size
-        good = (x == block[:, 0]) & (x >= 0) & (x < width) & (y == block[:, 1]) & (y >= 0) & (y < height)
-        if not good.all():
-            self._refuse(rows, i + int(good.argmin()), f"x in 0 to {width - 1} and y in 0 to {height - 1}")
-        if not np.isfinite(t).all():
-            self._refuse(rows, i + int(np.isfinite(t).argmin()), "a finite time in seconds")
-        backward = np.maximum.accumulate(t) - t
-        if len(t) and backward.max() > DISORDER:
-            worst = int(backward.argmax())
-            self._refuse(
-                rows,
-                i + worst,
-                f"stamps in order to within {1000 * DISORDER:g} ms (this one is "
-                f"{backward[worst]:.6g} s before an earlier row; sort the events by time)",
+class CheckedRows:
+    """Good events of an array without a copy: every slice is read from the array and sorted anew."""
+
+    def __init__(self, rows: NpyRows, checker: EventChecker, progress: Progress) -> None:
+        self._rows = rows
+        self._checker = checker
+        self._dropped: dict[int, np.ndarray] = {}  # by block: which of its rows are good (bool)
+        first, last, self.num_events = [], [], 0
+        for k, (events, good) in enumerate(checker.checked()):
+            progress(checker.share)
+            if not good.all():
+                self._dropped[k] = np.packbits(good)
+            self.num_events += len(events)
+            first.append(float(events.t.min()) if len(events) else np.inf)
+            last.append(float(events.t.max()) if len(events) else -np.inf)
+        # Blocks overlap by the disorder: the earliest stamp from a block on, and the latest up to it.
+        self._first = np.minimum.accumulate(first[::-1])[::-1]
+        self._last = np.maximum.accumulate(last)
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        return float(self._first[0]), float(self._last[-1])
+
+    def between(self, start: float, end: float) -> Events:
+        """Return the events with start <= t < end, sorted by time (stable)."""
+        blocks = range(int(np.searchsorted(self._last, start)), int(np.searchsorted(self._first, end)))
+        parts = []
+        for k in blocks:
+            rows = self._rows.rows(k * BLOCK, (k + 1) * BLOCK)
+            if k in self._dropped:
+                rows = rows[np.unpackbits(self._dropped[k], count=len(rows)).astype(bool)]
+            events = self._checker.converted(rows)
+            parts.append(events[(events.t >= start) & (events.t < end)])
+        return sorted_by_time(Events.concatenate(parts))
+
+
+def _checked(
+    source: NpyRows | TextRows, size: tuple[int, int], progress: Progress | None
+) -> tuple[EventsInMemory | MappedEvents | CheckedRows, CopySummary]:
+    """Return a file's good events: from its copy, which is made where there is none, or without one."""
+    is_small = isinstance(source, NpyRows) and len(source) <= IN_MEMORY
+    stored = EventCopy(cache_folder() / "events", source.path, size, source.columns)
+    if not is_small:
+        summary = stored.read()
+        if summary is not None:
+            return MappedEvents(stored.folder, size), summary
+    columns = recognised_columns(source, size)
+    checker = EventChecker(source, size, columns)
+
+    def summarised(num_events: int) -> CopySummary:
+        notes = list(source.notes) if isinstance(source, TextRows) else []
+        if columns.order != source.columns:
+            notes.append(f"columns look like {' '.join(columns.order)} and are read so")
+        notes += _bad_rows_note(checker.bad, checker.num_rows, source.counted)
+        dropped = checker.bad.number + (len(source.notes) if isinstance(source, TextRows) else 0)
+        if num_events == 0:
+            raise DataError(f"{source.name}: expected events, got none that is good")
+        return CopySummary(num_events, checker.num_rows, dropped, tuple(notes))
+
+    def shown(update: Progress) -> Iterator[Events]:
+        for part in checker.events():
+            update(checker.share)
+            yield part
+
+    with _bar(source.path, progress) as update:
+        if not is_small:
+            most = len(source) if isinstance(source, NpyRows) else source.num_bytes // TYPICAL_LINE
+            try:
+                if stored.has_room(most):
+                    summary = stored.write(shown(update), summarised)
+                    return MappedEvents(stored.folder, size), summary
+                reason = f"expected room for {most * BYTES_PER_EVENT / 1e9:.1f} GB"
+            except OSError as error:
+                reason = str(error.strerror or error)
+            logger.warning(
+                "%s: no copy of its events in %s (%s); they are checked anew each time",
+                *(source.path, stored.folder.parent, reason),
             )
-        positive = block[:, 3] == 1
-        others = block[:, 3][~positive]
-        if len(others):
-            if self._negative is None and others[0] in (-1, 0):
-                self._negative = float(others[0])
-            if self._negative is None or not (others == self._negative).all():
-                bad = ~positive & (True if self._negative is None else block[:, 3] != self._negative)
-                self._refuse(rows, i + int(np.argmax(bad)), "polarity -1 or +1 (or 0 or 1) throughout")
-        polarity = np.where(positive, np.int8(1), np.int8(-1))
-        return x, y, t, polarity
-
-    def _refuse(self, rows: np.ndarray, row: int, expected: str) -> None:
-        values = ", ".join(f"{float(v):.10g}" for v in rows[row])
-        raise DataError(
-            f"{self.name}: row {row + self.first_row}: expected {expected}, got x, y, t, p = {values} "
-            f"(image {self._size[0]}x{self._size[1]}, times in seconds)"
-        )
-
-    def _probe(self) -> tuple[float, float]:
-        """Look at blocks spread over the file; return the first and the last time."""
-        count = len(self)
-        if count == 0:
-            raise DataError(f"{self.name}: expected events, got an empty array of shape {self._layout.shape}")
-        starts = np.linspace(0, max(0, count - PROBE_LENGTH), PROBES).astype(np.int64)
-        first = last = float("nan")
-        seen = 0  # rows before this have been looked at, so that blocks of a small file do not overlap
-        with self._mapped() as rows:
-            ends = rows[[0, -1], 2].astype(np.float64)
-            if np.isfinite(ends).all() and abs(ends[1] - ends[0]) > LONGEST_RECORDING:
-                raise DataError(
-                    f"{self.name}: expected times in seconds, got {ends[0]:.10g} to {ends[1]:.10g}, "
-                    f"{(ends[1] - ends[0]) / 86400:.3g} days of recording; these look like micro- or "
-                    "nanoseconds: divide column 2 by 1e6 or 1e9"
-                )
-            for start in starts:
-                begin, seen = max(int(start), seen), min(int(start) + PROBE_LENGTH, count)
-                if begin >= seen:
-                    continue
-                _, _, t, _ = self._checked(rows, begin, seen)
-                if t.min() < last - DISORDER:
-                    expected = f"times in order (earlier rows reach {last:.6f} s; sort the events)"
-                    self._refuse(rows, begin + int(t.argmin()), expected)
-                first, last = float(np.fmin(first, t.min())), float(np.fmax(last, t.max()))
-        return first, last
+            checker = EventChecker(source, size, columns)
+            if isinstance(source, NpyRows):
+                rows = CheckedRows(source, checker, update)
+                return rows, summarised(rows.num_events)
+        events = Events.concatenate(list(shown(update)))
+    return EventsInMemory(events), summarised(len(events))
 
 
-def _read_layout(path: Path, name: str) -> _Layout:
-    """Read the header of the .npy file and check it against the file's size."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: event file not found")
-    size = path.stat().st_size
-    if size == 0:
-        raise DataError(f"{name}: the file is empty; expected a NumPy array of events (N, 4): x, y, t [s], p")
-    with path.open("rb") as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read_header = (
-                np.lib.format.read_array_header_1_0
-                if version == (1, 0)
-                else np.lib.format.read_array_header_2_0
-            )
-            shape, fortran_order, dtype = read_header(file)
-        except (ValueError, OSError, SyntaxError) as error:
-            raise DataError(
-                f"{name}: not readable as a NumPy .npy file ({' '.join(str(error).split())})"
-            ) from error
-        offset = file.tell()
-    if dtype.hasobject or dtype.kind not in "fiub":
-        raise DataError(
-            f"{name}: expected an (N, 4) array of numbers x, y, t [s], p; got element type {dtype}"
-        )
-    if len(shape) != 2 or shape[1] != 4:
-        raise DataError(f"{name}: expected an (N, 4) array with columns x, y, t [s], p; got shape {shape}")
-    if dtype.kind in "iub":
-        raise DataError(
-            f"{name}: expected times in seconds, which {dtype} cannot hold; save the array as float64"
-        )
-    expected = offset + shape[0] * 4 * dtype.itemsize
-    if size < expected:
-        raise DataError(
-            f"{name}: truncated: the header promises {shape[0]} events ({expected} bytes), the file has "
-            f"{size} bytes, {max(0, size - offset) // (4 * dtype.itemsize)} events; copy or download it again"
-        )
-    return _Layout(dtype, (shape[0], 4), fortran_order, offset)
+def _bad_rows_note(bad: BadRows, num_rows: int, counted: str) -> list[str]:
+    if not bad.number:
+        return []
+    are = "are" if bad.number > 1 else "is"
+    return [f"{bad.number} of {num_rows} {counted}s {are} bad and left out, first {bad.first}"]
+
+
+@contextmanager
+def _bar(path: Path, progress: Progress | None) -> Iterator[Progress]:
+    """Show a bar for a large file, unless the caller follows the progress."""
+    if progress is not None:
+        yield progress
+    elif path.stat().st_size < SLOW:
+        yield lambda share: None
+    else:
+        from rich.console import Console
+        from rich.markup import escape
+        from rich.progress import Progress as Bar
+
+        with Bar(transient=True, console=Console(stderr=True)) as bar:
+            task = bar.add_task(f"checking {escape(path.name)} (first use)", total=1.0)
+            yield lambda share: bar.update(task, completed=share)

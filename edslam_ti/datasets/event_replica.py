@@ -134,6 +134,7 @@ class EventReplicaSequence(EventDepthSequence):
             folder, contrast_threshold, calibration.contrast_threshold
         )
         self._events = EventFile(events_folder / EVENTS, self.camera.width, self.camera.height)
+        self.num_dropped_events = self._events.num_dropped
 
         first, _ = self._events.time_range
         self.time_offset = first if abs(first) > LATEST_START else 0.0

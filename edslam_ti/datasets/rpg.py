@@ -18,15 +18,11 @@ to where it is seen, so that none stays without events and none counts those of 
 or is dropped.
 """
 
-import hashlib
-import logging
-import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from edslam_ti.cache import cached
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.datasets.event_file import EventFile
@@ -41,15 +37,10 @@ from edslam_ti.datasets.files import (
 )
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
-from edslam_ti.output import atomic_file, write_npy_header
 from edslam_ti.trajectory import Trajectory, read_tum
 
+EVENTS_AT_ONCE = 1_000_000  # undistorting takes some 70 bytes an event, its result 13
 TUM_DEPTH_SCALE = 5000.0  # PNG units in a metre
-EVENT_DTYPE = np.dtype("<f8")  # of the binary copy of events.txt
-ROWS_AT_A_TIME = 1_000_000
-SLOW_TO_PARSE = 200_000_000  # bytes of text, about ten million events: several seconds
-
-logger = logging.getLogger(__name__)
 
 
 class RpgSequence(EventDepthSequence):
@@ -77,7 +68,8 @@ class RpgSequence(EventDepthSequence):
         scale_is_given = "depth_scale" in stated.model_fields_set
         self._metres_per_unit = stated.metres_per_unit if scale_is_given else 1 / TUM_DEPTH_SCALE
 
-        self._events = open_text_events(folder / "events.txt", width, height)
+        self._events = EventFile(folder / "events.txt", width, height, is_text=True)
+        self.num_dropped_events = self._events.num_dropped
         first, _ = self._events.time_range
         self.time_offset = first if abs(first) > LATEST_START else 0.0
         if self.time_offset:
@@ -136,6 +128,9 @@ class _EventUndistortion:
 
     def __call__(self, events: Events) -> Events:
         """Return the events as an undistorted camera had sent them, in the same order."""
+        return Events.concatenate([self._undistorted(piece) for piece in events.pieces(EVENTS_AT_ONCE)])
+
+    def _undistorted(self, events: Events) -> Events:
         pixel = events.y.astype(np.int64) * self._width + events.x
         first, number = self._first[pixel], self._first[pixel + 1] - self._first[pixel]
         event = np.repeat(np.arange(len(pixel)), number)
@@ -159,54 +154,6 @@ def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:
         f"{folder}: no depth found; expected depth/*.png or derived_depth/*.png (16 bits, undistorted, "
         "numbered as the lines of images.txt)"
     )
-
-
-def open_text_events(path: Path, width: int, height: int) -> EventFile:
-    """Return the events of a text file; it is parsed once, into a binary copy in the user's cache.
-
-    The copy is known by the text's path, size and time of change. $EDSLAM_CACHE moves the cache.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; expected lines 't x y p'")
-    status = path.stat()
-    if status.st_size == 0:
-        raise DataError(f"{path}: the file is empty; expected lines 't x y p'")
-    identity = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}"
-    digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
-    binary = cached(Path("events") / f"{path.parent.name}_{digest}.npy")
-    if not binary.is_file():
-        if status.st_size > SLOW_TO_PARSE:
-            # A warning shows on stderr where the program has not set up logging: the user is made to wait.
-            logger.warning("reading %s once (%.0f MB) ...", path, status.st_size / 1e6)
-        with atomic_file(binary) as temporary:
-            _parse_events(path, temporary)
-    return EventFile(binary, width, height, name=str(path), first_row=1)
-
-
-def _parse_events(text: Path, binary: Path) -> None:
-    """Write the rows 't x y p' of a text file as a float64 .npy of rows x, y, t, p."""
-    count = 0
-    with text.open() as source, binary.open("wb") as target, warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # no rows left: the loop's end
-        write_npy_header(target, EVENT_DTYPE, 0, 4)
-        while True:
-            try:
-                rows = np.loadtxt(source, max_rows=ROWS_AT_A_TIME, comments=None, ndmin=2)
-            except ValueError as error:
-                raise DataError(
-                    f"{text}: expected lines 't x y p'; behind row {count}: {' '.join(str(error).split())}"
-                ) from error
-            if rows.size == 0:
-                break
-            if rows.shape[1] != 4:
-                raise DataError(f"{text}: expected 4 numbers a line 't x y p', got {rows.shape[1]}")
-            rows[:, [1, 2, 0, 3]].astype(EVENT_DTYPE).tofile(target)
-            count += len(rows)
-            if len(rows) < ROWS_AT_A_TIME:
-                break
-        if count == 0:
-            raise DataError(f"{text}: expected lines 't x y p', got an empty file")
-        write_npy_header(target, EVENT_DTYPE, count, 4)
 
 
 def is_rpg(folder: Path) -> bool:

@@ -10,8 +10,10 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation.images import align_views
+from edslam_ti.evaluation.trajectories import align_views
+from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.ray_casting import RayCaster, pixel_rays
 from edslam_ti.trajectory import Trajectory
 
 NUM_SAMPLES = 100_000  # points drawn on a reconstructed mesh
@@ -31,7 +33,7 @@ class SurfaceErrors:
 
 
 @dataclass(frozen=True)
-class Look:
+class DepthView:
     """Depth seen by one camera."""
 
     camera: Camera
@@ -43,21 +45,17 @@ class TrueSurfaces:
     """The triangles of a scene."""
 
     def __init__(self, path: Path) -> None:
-        self._scene = _ray_casting(read_triangles(path))
+        """Read a mesh file; raise FileNotFoundError or DataError where there is none."""
+        self._caster = RayCaster.of_mesh(read_triangle_mesh(path))
 
     def depth(self, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:  # [H, W] metres, 0 = nothing
         """Return the depth seen from a pose."""
-        o3d = load_open3d()
-        directions = camera.rays() @ T_world_camera[:3, :3].T  # [H, W, 3] with z = 1: t is the depth
-        origins = np.broadcast_to(T_world_camera[:3, 3], directions.shape)
-        rays = np.concatenate([origins, directions], -1).astype(np.float32)
-        distance = self._scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
-        return np.where(np.isfinite(distance), distance, 0).astype(np.float32)
+        return self._caster.cast(pixel_rays(camera, T_world_camera)).depth
 
-    def looks(self, camera: Camera, poses: Iterable[np.ndarray]) -> "list[Look]":
+    def views(self, camera: Camera, poses: Iterable[np.ndarray]) -> list[DepthView]:
         """Return what cameras at these poses [4, 4] see, at half the size."""
         small = camera.downscaled(2)
-        return [Look(small, T, self.depth(small, T)) for T in poses]
+        return [DepthView(small, T, self.depth(small, T)) for T in poses]
 
     def errors(
         self,
@@ -66,7 +64,7 @@ class TrueSurfaces:
         T_world_estimate: np.ndarray,  # [4, 4], from the mesh's frame to that of the surfaces
         seed: int = 0,
     ) -> SurfaceErrors:
-        """Compare a mesh with the surfaces."""
+        """Compare a mesh with the surfaces; raise DataError where the mesh or `seen` is empty."""
         if len(mesh.triangles) == 0 or len(seen) == 0:
             raise DataError(
                 f"mesh errors: expected triangles and points that a camera saw, got {len(mesh.triangles)} "
@@ -76,8 +74,8 @@ class TrueSurfaces:
         o3d.utility.random.seed(seed)
         moved = o3d.geometry.TriangleMesh(mesh).transform(T_world_estimate)
         drawn = np.asarray(moved.sample_points_uniformly(NUM_SAMPLES).points, np.float32)
-        to_truth = self._scene.compute_distance(o3d.core.Tensor(drawn)).numpy()
-        to_mesh = _ray_casting(moved).compute_distance(o3d.core.Tensor(seen)).numpy()
+        to_truth = self._caster.distances_to(drawn)
+        to_mesh = RayCaster.of_mesh(moved).distances_to(seen)
         return SurfaceErrors(
             100 * float(to_truth.mean()),
             100 * float(to_mesh.mean()),
@@ -88,7 +86,7 @@ class TrueSurfaces:
 def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -> SurfaceErrors:
     """Compare a mesh in the frame of an estimated path with what the sequence's camera saw on the way.
 
-    Seen is what lies in a view of the true path at the estimate's times, or of those beside it.
+    A surface counts as seen if it lies in a view of the true path at the estimate's times, or in a novel one.
     """
     if sequence.surfaces_file is None or sequence.truth is None:
         raise DataError(
@@ -99,17 +97,17 @@ def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -
     if not inside:
         raise DataError(f"{sequence.scene}: the estimate has no pose at a time that the truth covers")
     truth = sequence.truth.resampled(np.array(inside))
-    beside = [v.T_world_camera for v in sequence.novel_views() if inside[0] <= v.timestamp <= inside[-1]]
+    novel = [v.T_world_camera for v in sequence.novel_views() if inside[0] <= v.timestamp <= inside[-1]]
     surfaces = TrueSurfaces(sequence.surfaces_file)
-    seen = seen_points(surfaces.looks(sequence.camera, [*lookouts(truth), *beside]))
+    seen = seen_points(surfaces.views(sequence.camera, [*viewpoints(truth), *novel]))
     return surfaces.errors(mesh, seen, align_views(estimate.resampled(truth.timestamps).poses, truth.poses))
 
 
-def seen_points(looks: Iterable[Look]) -> np.ndarray:  # [N, 3] float32 metres, world
+def seen_points(views: Iterable[DepthView]) -> np.ndarray:  # [N, 3] float32 metres, world
     """Return points evenly spread over all that was seen."""
-    kept = [np.empty((0, 3), np.float32)]
-    kept += [_back_projected(a.depth, a.camera, a.T_world_camera).astype(np.float32) for a in looks]
-    points = np.concatenate(kept)
+    parts = [np.empty((0, 3), np.float32)]
+    parts += [_world_points(v.depth, v.camera, v.T_world_camera).astype(np.float32) for v in views]
+    points = np.concatenate(parts)
     _, first = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(first)]
 
@@ -118,54 +116,34 @@ def seen_pixels(
     camera: Camera,
     depth: np.ndarray,  # [H, W] metres of a view, 0 = missing
     T_world_camera: np.ndarray,  # [4, 4] of that view
-    looks: Iterable[Look],
+    views: Iterable[DepthView],
 ) -> np.ndarray:  # [H, W] bool
-    """Return the pixels of a view whose surface is visible in one of the looks, too."""
-    points = _back_projected(depth, camera, T_world_camera)
+    """Return the pixels of a view whose surface is visible in one of the views, too."""
+    points = _world_points(depth, camera, T_world_camera)
     seen = np.zeros(len(points), bool)
 
-    def distance(look: Look) -> float:
-        return float(np.linalg.norm(look.T_world_camera - T_world_camera))
+    def distance(view: DepthView) -> float:
+        return float(np.linalg.norm(view.T_world_camera - T_world_camera))
 
-    for look in sorted(looks, key=distance):  # the nearest see most: little is left for the others
+    for view in sorted(views, key=distance):  # the nearest see most: little is left for the others
         left = np.flatnonzero(~seen)
         if len(left) == 0:
             break
-        T_camera_world, seer = np.linalg.inv(look.T_world_camera), look.camera
-        p = points[left] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-        z = np.maximum(p[:, 2], 1e-6)
-        u = np.rint(seer.fx * p[:, 0] / z + seer.cx)
-        v = np.rint(seer.fy * p[:, 1] / z + seer.cy)
-        inside = (p[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < seer.width) & (v < seer.height)
-        front = look.depth[v[inside].astype(int), u[inside].astype(int)]
+        T_camera_world = np.linalg.inv(view.T_world_camera)
+        u, v, z = view.camera.project(points[left] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
+        u, v = np.rint(u), np.rint(v)
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < view.camera.width) & (v < view.camera.height)
+        front = view.depth[v[inside].astype(int), u[inside].astype(int)]
         seen[left[inside]] = z[inside] < front + np.maximum(OCCLUSION, OCCLUSION * front)
     result = np.zeros(depth.shape, bool)
     result[depth > 0] = seen
     return result
 
 
-def lookouts(path: Trajectory) -> list[np.ndarray]:  # [4, 4] each
-    """Return poses of a path from which all is seen that the path sees."""
+def viewpoints(path: Trajectory) -> list[np.ndarray]:  # [4, 4] each
+    """Return a subset of a path's poses that together see everything the path sees."""
     return path.spread(VIEW_STEP, VIEW_TURN)
 
 
-def read_triangles(path: Path) -> Any:
-    """Return the Open3D TriangleMesh in a file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: mesh not found")
-    mesh = load_open3d().io.read_triangle_mesh(str(path))
-    if len(mesh.triangles) == 0:
-        raise DataError(f"{path}: expected a mesh, could not read any triangle")
-    return mesh
-
-
-def _back_projected(depth: np.ndarray, camera: Camera, T: np.ndarray) -> np.ndarray:  # [N, 3] metres, world
-    known = depth > 0
-    return depth[known][:, None] * camera.rays()[known] @ T[:3, :3].T + T[:3, 3]
-
-
-def _ray_casting(mesh: Any) -> Any:
-    o3d = load_open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-    return scene
+def _world_points(depth: np.ndarray, camera: Camera, T: np.ndarray) -> np.ndarray:  # [N, 3] metres, world
+    return camera.back_project(depth) @ T[:3, :3].T + T[:3, 3]

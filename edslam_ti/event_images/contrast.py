@@ -19,7 +19,9 @@ import cv2
 import numpy as np
 
 from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.event_images.change import AVERAGE_BIAS
 from edslam_ti.events import Events
+from edslam_ti.frame import EventCounts
 
 DEFAULT = 0.1  # Sec. IV-A: 0.1 synthetic, 0.2 real
 GAPS = (1, 2, 4)  # images between the two of a pair
@@ -27,7 +29,6 @@ MAX_PAIRS = 8  # of each gap
 LONGEST_PAIR = 0.3  # seconds between the two
 DARKEST, BRIGHTEST = 0.1, 0.98  # grey values that are neither lost in 8 bits nor clipped
 MIN_EVENTS = 400  # of either polarity
-LEAN = 0.25  # thresholds that brightness is beyond the last event, in its direction, on average
 HISTORY = 0.3  # seconds before a pair in which the last event of a pixel is looked for
 MIN_DIFFERENCE = 0.05  # of C+ and C-; smaller ones are within the errors of the estimate
 LOG_EPSILON = 0.004
@@ -134,17 +135,16 @@ def _products(sequence: EventDepthSequence, first: int, second: int) -> _Product
 
 
 def _regressors(events: Events, start: float, shape: tuple[int, int]) -> np.ndarray:  # [2, H, W] float32
-    """Return p and -n from the start on, each with what brightness leans beyond the last event."""
-    result = np.zeros((2, *shape), np.float32)
-    for sign, until in ((-1, start), (1, np.inf)):
-        part = events.between(-np.inf, until)
-        last = np.zeros(shape, np.int8)
-        last[part.y, part.x] = part.polarity  # of repeated pixels the last one stays
-        result[0] += sign * LEAN * (last > 0)
-        result[1] -= sign * LEAN * (last < 0)
-    inside = events.between(start, np.inf)
-    np.add.at(result, ((inside.polarity < 0).astype(int), inside.y, inside.x), inside.polarity)
-    return result
+    """Return p and -n from the start on, each with how far brightness lies beyond the last event."""
+    before = EventCounts(events.between(-np.inf, start), shape).last
+    counts = EventCounts(events.between(start, np.inf), shape)
+    last = np.where(counts.last == 0, before, counts.last)
+    bias = np.float32(AVERAGE_BIAS)
+    p, n = (
+        counts.numbers[..., k].astype(np.float32) + bias * (sign * last > 0) - bias * (sign * before > 0)
+        for k, sign in ((1, 1), (0, -1))
+    )
+    return np.stack([p, -n])
 
 
 def _solved(M: np.ndarray, v: np.ndarray) -> np.ndarray:  # [2, 2], [2] -> [2]

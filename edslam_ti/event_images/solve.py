@@ -1,59 +1,46 @@
-"""Log-brightness images from events: what a keyframe looked like, without any camera image.
+"""Log-brightness images solved from events, depth and poses: what a camera would have seen, without one.
 
-With l the unknown log brightness at the keyframe's time and E_k the change summed up since then
-(Eq. 11), the image at time k is l + E_k. A surface point seen at pixel u of the keyframe and at x_k(u)
-of frame k keeps its brightness:
+With l the unknown log brightness at one time and E_k the change summed up from there to time k (Eq. 11), the
+image at time k is l + E_k. A surface point seen at pixel x of frame j and at x' = w(x) of frame k (Eq. 3,
+through measured depth) has one brightness:
 
-    l(u) = l(x_k(u)) + E_k(x_k(u))           for every frame k and pixel u with depth
+    l(x) + E_j(x) = l(x') + E_k(x')          for every pixel with depth and many pairs of frames
 
-Linear equations in l alone; x_k comes from depth and poses, l(x) is interpolated. Unlike a time surface
-(Eq. 1), which lags its edges by an amount that depends on the motion, such an image belongs to the
-surfaces themselves, so that alignment to it is not biased.
+with l and E_k at x' interpolated bilinearly. The equations are linear in l alone, and absolute brightness
+stays unknown. Unlike a time surface (Eq. 1), which lags its edges by an amount that depends on the motion,
+such an image belongs to the surfaces themselves, so that alignment to it is not biased. There are two uses:
+
+- The tracker solves for the image at a keyframe's time, where E_j = 0, from pairs of the keyframe with a few
+  other frames (`solve_log_brightness_image`), often and at reduced size.
+- The mapper solves for the image at the beginning of some seconds of events, from pairs of many frames
+  (`solve_start_image`). The unknowns are the pixels of one image however long the recording, so least squares
+  finds all of them in seconds, whatever their distance in the image, where descent on single intervals
+  (Eq. 12) needs thousands of steps for the low frequencies. Frames whose image is known already, from an
+  earlier start, tie their brightness in as a given.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
-from edslam_ti.events import Events
+from edslam_ti.depth_images import block_depth, block_means
+from edslam_ti.geometry import inverse
 from edslam_ti.kernels import brightness_image, time_surface
+from edslam_ti.kernels.brightness_image import ChangeImage, Pair, solve_brightness_image
 from edslam_ti.kernels.runtime import check_shape
 
-HYSTERESIS = 0.5  # thresholds
-HUBER = 0.1  # log brightness; equations beyond count less (occlusions, reflections, wrong depth)
+# Log brightness; equations beyond count less (occlusions, reflections, wrong depth). Frames of a start image
+# are farther apart, and errors of their events have added up for longer.
+HUBER, START_HUBER = 0.1, 0.15
+ROBUST = (False, True)  # solutions of a start image: the second weighs equations by how the first fits them
+PRIOR_WEIGHT = 1e-3  # of the start's previous value against one equation
+OFFSETS = (1, 2, 5, 9)  # in the list of views, between the two of a pair
 
 
-class BrightnessChange:
-    """Log-brightness change of every pixel since the beginning, from events (Eq. 11).
-
-    A pixel's brightness lies up to one threshold C beyond its last event, in that event's direction
-    unless it has turned since: C / 2 on average. Without that half threshold a moving edge of contrast g
-    per pixel trails by C / 2g pixels, which biases alignment.
-    """
-
-    def __init__(self, shape: tuple[int, int], positive: float, negative: float) -> None:
-        """`positive` and `negative` are the sensor's thresholds C+ and C-, in log brightness."""
-        self._thresholds = np.float32(positive), np.float32(negative)
-        self._counts = np.zeros((*shape, 2), np.int32)  # negative and positive events
-        self._last = np.zeros(shape, np.int8)  # polarity of the last event
-
-    def add(self, events: Events) -> None:
-        """Add events that follow those added before."""
-        time_surface.count_events(events.x, events.y, events.polarity, self._counts, self._last)
-
-    def log_brightness(self) -> np.ndarray:  # [H, W] float32
-        """Return the change since the beginning."""
-        positive, negative = self._thresholds
-        beyond = np.float32(HYSTERESIS)
-        fell = self._counts[..., 0].astype(np.float32) + beyond * (self._last < 0)
-        rose = self._counts[..., 1].astype(np.float32) + beyond * (self._last > 0)
-        return positive * rose - negative * fell
-
-    def reset(self) -> None:
-        """Begin anew."""
-        self._counts[:], self._last[:] = 0, 0
+# --- the image of a keyframe ---
 
 
 @dataclass(frozen=True)
@@ -79,13 +66,94 @@ def solve_log_brightness_image(
     `is_robust`: equations that the prior fits badly count less (Huber).
     """
     check_shape("prior", prior, depth.shape)
-    own = brightness_image.ChangeImage(np.zeros(depth.shape, np.float32), depth)
-    images = [own, *(brightness_image.ChangeImage(o.change, o.depth) for o in observations)]
-    pairs = [brightness_image.Pair(0, k, o.T_camera_keyframe) for k, o in enumerate(observations, 1)]
-    image, _ = brightness_image.solve_brightness_image(
+    own = ChangeImage(np.zeros(depth.shape, np.float32), depth)
+    images = [own, *(ChangeImage(o.change, o.depth) for o in observations)]
+    pairs = [Pair(0, k, o.T_camera_keyframe) for k, o in enumerate(observations, 1)]
+    image, _ = solve_brightness_image(
         images, pairs, camera.intrinsics, prior, prior_weight, HUBER, iterations, [is_robust]
     )
     return image
+
+
+# --- the image at the beginning ---
+
+
+@dataclass(frozen=True)
+class EventView:
+    """What the event camera has measured up to the time of a frame."""
+
+    change: np.ndarray  # [H, W] float32 log brightness less the start image, Eq. 11; absolute if not relative
+    depth: np.ndarray | None  # [H, W] float32 metres, 0 = missing
+    T_world_camera: np.ndarray  # [4, 4]
+    is_relative: bool = True
+
+
+@dataclass(frozen=True)
+class StartImage:
+    """Log brightness at the beginning."""
+
+    log_brightness: np.ndarray  # [H, W] float32
+    is_observed: np.ndarray  # [H, W] bool: compared with other pixels; elsewhere as the neighbours
+
+
+def solve_start_image(
+    views: Sequence[EventView],  # in order of time
+    camera: Camera,
+    start: np.ndarray,  # [H, W] float32, where to begin; stays where nothing is observed
+    iterations: dict[int, int],  # of conjugate gradients by reduction of the images, coarse first
+) -> StartImage:
+    """Return the start image, by iteratively reweighted least squares from coarse to fine.
+
+    Only its difference to `start` is at reduced size: details of `start` smaller than that survive.
+    """
+    log_brightness, observed = start.astype(np.float32), np.zeros(camera.shape, bool)
+    T_camera_world = [inverse(v.T_world_camera) for v in views]
+    pairs = [Pair(k, j, T_camera_world[j] @ views[k].T_world_camera) for k, j in _pairs(views)]
+    for reduction, count in iterations.items():
+        small = camera if reduction == 1 else camera.downscaled(reduction)
+        images = [_reduced(view, reduction) for view in views]
+        before = block_means(log_brightness, reduction)
+        solution, seen = solve_brightness_image(
+            images, pairs, small.intrinsics, before, PRIOR_WEIGHT, START_HUBER, count, ROBUST, is_strict=True
+        )
+        difference = _filled(solution - before, seen)
+        log_brightness = log_brightness + _enlarged(difference, camera.shape)
+        observed |= _enlarged(seen.astype(np.float32), camera.shape) > 0.5
+    return StartImage(log_brightness, observed)
+
+
+def _reduced(view: EventView, reduction: int) -> ChangeImage:
+    depth = None if view.depth is None else block_depth(view.depth, reduction)
+    return ChangeImage(block_means(view.change, reduction), depth, not view.is_relative)
+
+
+def _pairs(views: Sequence[EventView]) -> list[tuple[int, int]]:
+    """Return pairs of views at short and long distances in the list, both ways."""
+    offsets = OFFSETS if len(views) < 12 else OFFSETS[1:]
+    pairs = [(k, k + o) for o in offsets for k in range(len(views) - o)]
+    pairs += [(j, k) for k, j in pairs]
+    return [(k, j) for k, j in pairs if views[k].is_relative or views[j].is_relative]
+
+
+def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:  # [h, w]
+    """Return the values where known, else the mean of what is known nearby (or 0)."""
+    result, weight = np.where(known, values, 0).astype(np.float32), known.astype(np.float32)
+    filled, total = result.copy(), weight.copy()
+    for size in (5, 15, 45):
+        blurred = cv2.blur(result, (size, size)), cv2.blur(weight, (size, size))
+        gap = (total == 0) & (blurred[1] > 1e-3)
+        filled[gap], total[gap] = blurred[0][gap] / blurred[1][gap], 1
+    return filled
+
+
+def _enlarged(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:  # [h, w] -> [H, W]
+    """Return an image of block means at full size, bilinearly; odd edges repeat the last block."""
+    if image.shape == shape:
+        return image
+    r = shape[1] // image.shape[1]
+    h, w = image.shape[0] * r, image.shape[1] * r
+    enlarged = cv2.resize(image.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
+    return np.pad(enlarged, ((0, shape[0] - h), (0, shape[1] - w)), mode="edge")
 
 
 def compile_kernels() -> None:

@@ -1,1 +1,1 @@
-"""Measurements over many recordings: what `apps/reproduce.py` runs, and how its tables come about."""
+"""Measurements over many recordings: what `edslam reproduce` runs, and how its tables come about."""

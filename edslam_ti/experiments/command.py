@@ -1,118 +1,125 @@
-"""What `apps/reproduce.py` does: its commands, and what each of them takes."""
+"""What `edslam reproduce` does: its commands, and what each of them takes."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.console import Console
 
-from edslam_ti.command_line import UsageError
-from edslam_ti.experiments.cases import EVERYTHING, Selection, all_cases, quick_cases
+from edslam_ti.arguments import UsageError
+from edslam_ti.cold_start import load_kernels
+from edslam_ti.config import Stage
+from edslam_ti.experiments.selection import Selection
 
 
-def tracking(
-    select: Annotated[Selection, tyro.conf.arg(name="")] = EVERYTHING,
-    methods: tuple[str, ...] = ("ed_slam", "ed_slam_paper", "open3d_icp", "open3d_rgbd"),
-    out: Path = Path("results/reproduce"),
-    data_dir: Path = Path("data"),
-    quick: bool = False,
-    mapping: bool = False,
-    fresh: bool = False,
-    keep_recordings: bool = True,
-    threads: int = 2,
-) -> None:
-    """Run methods over the bench.
+class TrackingOptions(Selection):
+    """Which cases, methods and places."""
 
-    Args:
-        select: filters
-        methods: methods to compare, side by side in the tables
-        out: folder that receives results.json, tracking.md, the pictures, and one file per run
-        data_dir: folder with trajectories/, scenes/ and slider_depth/; cases without their data are skipped
-        quick: four short cases instead of all
-        mapping: run the whole system instead of tracking alone
-        fresh: run again what has a result already
-        keep_recordings: false: delete each simulated recording after its last case
-        threads: CPU threads
-    """
-    cases = [case for case in (quick_cases() if quick else all_cases()) if select.includes(case)]
-    if not cases:
-        raise UsageError("no case passes the filters; leave some out")
-    # After the arguments: torch and Taichi take seconds to load.
+    methods: tuple[str, ...] = ("ed_slam", "ed_slam_paper", "open3d_icp", "open3d_rgbd")
+    """Methods to compare, side by side in the tables."""
+    out: Path = Path("results/reproduce")
+    """Folder that receives results.json, tracking.md, the pictures, and one file per run."""
+    data_dir: Path = Path("data")
+    """Folder with trajectories/, scenes/ and slider_depth/; cases without their data are skipped."""
+    quick: bool = False
+    """Four short cases instead of all."""
+    mapping: bool = False
+    """Run the whole system instead of tracking alone."""
+    fresh: bool = False
+    """Run again what has a result already."""
+    keep_recordings: bool = True
+    """false: delete each simulated recording after its last case."""
+    threads: int = 2
+    """CPU threads."""
+
+
+def tracking(options: TrackingOptions) -> None:
+    """Run methods over the bench."""
+    load_kernels()
+    from edslam_ti.experiments.cases import all_cases, quick_cases
     from edslam_ti.experiments.recordings import Recordings
     from edslam_ti.experiments.report import write_report
     from edslam_ti.experiments.runs import methods_as_variants, run_all
 
-    variants = methods_as_variants(methods, mapping)
-    recordings = Recordings(data_dir)
+    cases = [case for case in (quick_cases() if options.quick else all_cases()) if options.includes(case)]
+    if not cases:
+        raise UsageError("no case passes the filters; leave some out")
+    variants = methods_as_variants(options.methods, options.mapping)
+    recordings = Recordings(options.data_dir)
+    keep, fresh, out = options.keep_recordings, options.fresh, options.out
     results: list[dict[str, Any]] = []
     try:
-        results.extend(run_all(cases, variants, recordings, out, Console(), threads, fresh, keep_recordings))
+        results.extend(run_all(cases, variants, recordings, out, Console(), options.threads, fresh, keep))
     finally:  # what there is before Ctrl-C, too
         if results:
             table = write_report(results, out, "Tracking")
             print(f"{table}: {len(results)} of {len(cases) * len(variants)} runs")
 
 
-def ablations(
-    scenes: tuple[str, ...] = ("office0", "room0", "wall"),
-    seeds: tuple[int, ...] = (0,),
-    out: Path = Path("results/ablations"),
-    document: Path | None = None,
-    fresh: bool = False,
-    threads: int = 2,
-) -> None:
-    """Change one setting of the tracker at a time.
+class AblationOptions(Stage):
+    """Which recordings, and where the tables go."""
 
-    `document` holds the lines `<!-- ablations -->` and `<!-- end ablations -->`.
+    scenes: tuple[str, ...] = ("office0", "room0", "wall")
+    """Built-in scenes, with Kinect-like depth at 20 Hz."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of path and noise."""
+    out: Path = Path("results/ablations")
+    """Folder that receives ablations.md and one file per run."""
+    document: Path | None = None
+    """Markdown file that gets the tables, too, between its lines `<!-- ablations -->` and
+    `<!-- end ablations -->`."""
+    fresh: bool = False
+    """Run again what has a result already."""
+    threads: int = 2
+    """CPU threads."""
 
-    Args:
-        scenes: built-in scenes, with Kinect-like depth at 20 Hz
-        seeds: seeds of path and noise
-        out: folder that receives ablations.md and one file per run
-        document: Markdown file that gets the tables, too, between its marks for them
-        fresh: run again what has a result already
-        threads: CPU threads
-    """
+
+def ablations(options: AblationOptions) -> None:
+    """Change one setting of the tracker at a time."""
+    load_kernels()
     from edslam_ti.experiments.ablations import ablation_cases, ablation_markdown, ablation_variants
     from edslam_ti.experiments.recordings import Recordings
     from edslam_ti.experiments.report import insert_into
     from edslam_ti.experiments.runs import run_all
 
-    cases, recordings = ablation_cases(scenes, seeds), Recordings(Path())
-    results = list(run_all(cases, ablation_variants(), recordings, out, Console(), threads, fresh))
+    cases, recordings = ablation_cases(options.scenes, options.seeds), Recordings(Path())
+    console, threads, fresh = Console(), options.threads, options.fresh
+    results = list(run_all(cases, ablation_variants(), recordings, options.out, console, threads, fresh))
     text = ablation_markdown(results)
-    (out / "ablations.md").write_text(text)
-    if document is not None:
-        insert_into(document, "ablations", text)
+    (options.out / "ablations.md").write_text(text)
+    if options.document is not None:
+        insert_into(options.document, "ablations", text)
     print(text)
 
 
-def long_stream(
-    recording: Path | None = None,
-    scene: str = "office0",
-    duration: float = 30.0,
-    rounds: int = 2,
-    width: int = 384,
-    height: int = 240,
-    config: Path | None = None,
-    length: float = 5.0,
-    out: Path = Path("results/long_stream"),
-    threads: int = 2,
-) -> None:
-    """Measure time per frame, memory and size of the map along a recording, tracking and mapping.
+class LongStreamOptions(Stage):
+    """Which recording, and how it is measured."""
 
-    Args:
-        recording: folder in EventReplica's layout; omitted: the loop through a built-in room
-        scene: built-in room; 30 s of office0 take 4 GB at full size
-        duration: seconds of the made recording
-        rounds: how often a recording that ends where it began is played
-        width: of the made recording, pixels
-        height: of the made recording, pixels
-        config: YAML file with settings that differ from the defaults
-        length: seconds of data that a line of the table covers
-        out: folder that receives long_stream.md, long_stream.png and frames.csv
-        threads: CPU threads
-    """
+    recording: Path | None = None
+    """Folder in EventReplica's layout; omitted: the loop through a built-in room."""
+    scene: str = "office0"
+    """Built-in room; 30 s of office0 take 4 GB at full size."""
+    duration: float = 30.0
+    """Seconds of the made recording."""
+    rounds: int = 2
+    """How often a recording that ends where it began is played."""
+    width: int = 384
+    """Of the made recording, pixels."""
+    height: int = 240
+    """Of the made recording, pixels."""
+    config: Path | None = None
+    """YAML file with settings that differ from the defaults."""
+    length: float = 5.0
+    """Seconds of data that a line of the table covers."""
+    out: Path = Path("results/long_stream")
+    """Folder that receives long_stream.md, long_stream.png and frames.csv."""
+    threads: int = 2
+    """CPU threads."""
+
+
+def long_stream(options: LongStreamOptions) -> None:
+    """Measure time per frame, memory and size of the map along a recording, tracking and mapping."""
+    load_kernels()
     from edslam_ti import kernels
     from edslam_ti.config import Config, read_differences
     from edslam_ti.datasets import EventDepthSequence
@@ -122,16 +129,41 @@ def long_stream(
     from edslam_ti.experiments.cases import Recording
     from edslam_ti.experiments.long_stream import measure
 
-    kernels.init("cpu", threads=threads)
+    kernels.init("cpu", threads=options.threads)
+    recording = options.recording
     if recording is None:
-        loop = Recording(scene, "loop", duration=duration).settings
-        recording = builtin_sequence_folder(scene, loop.model_copy(update={"width": width, "height": height}))
+        loop = Recording(options.scene, "loop", duration=options.duration).settings
+        size = {"width": options.width, "height": options.height}
+        recording = builtin_sequence_folder(options.scene, loop.model_copy(update=size))
     sequence: EventDepthSequence = EventReplicaSequence(recording)
-    if rounds > 1:
-        sequence = RepeatedSequence(sequence, rounds)
-    settings = Config(threads=threads).updated({} if config is None else read_differences(config))
-    measure(sequence, settings, out, length, print)
-    print((out / "long_stream.md").read_text())
+    if options.rounds > 1:
+        sequence = RepeatedSequence(sequence, options.rounds)
+    differences = {} if options.config is None else read_differences(options.config)
+    settings = Config(threads=options.threads).updated(differences)
+    measure(sequence, settings, options.out, options.length, print)
+    print((options.out / "long_stream.md").read_text())
 
 
-COMMANDS = {"tracking": tracking, "ablations": ablations, "long_stream": long_stream}
+class ReportOptions(Stage):
+    """Which documents."""
+
+    root: Path = Path()
+    """Checkout that holds README.md and docs/."""
+    check: bool = False
+    """Change nothing, and fail if a document differs from its numbers."""
+
+
+def report(options: ReportOptions) -> None:
+    """Write the tables of README.md and docs/*.md from the numbers in docs/results/*.json."""
+    from edslam_ti.experiments.documents import report_tables
+
+    report_tables(options.root, options.check)
+
+
+# command -> its options, and what it does with them
+COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
+    "tracking": (TrackingOptions, tracking),
+    "ablations": (AblationOptions, ablations),
+    "long_stream": (LongStreamOptions, long_stream),
+    "report": (ReportOptions, report),
+}

@@ -13,34 +13,36 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import taichi as ti
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from edslam_ti.geometry import adjoint
 from edslam_ti.kernels import brightness_image, depth_average, patch_warp, reference
 from edslam_ti.kernels import time_surface as surfaces
 from edslam_ti.kernels.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from edslam_ti.kernels.constants import NEAR
+from edslam_ti.kernels.engine import ENGINE
 from edslam_ti.kernels.patch_warp import (
-    NEAR,
+    MAX_SLOPE,
     Alignment,
     Direction,
     Patches,
     ResidualModel,
-    adjoint,
     extract_patches,
 )
 from edslam_ti.kernels.projection import MIN_ALPHA
 from edslam_ti.kernels.rasterization import rasterize
+from edslam_ti.kernels.runtime import is_gpu, synchronize
 from edslam_ti.kernels.time_surface import MANY_EVENTS, time_surface, update_last_timestamps
 from edslam_ti.kernels.view_losses import compare_change, compare_view
 
-OURS = "Taichi"
+OURS = ENGINE.capitalize()  # in the names of rows
 TWIN_LIMIT = 3e7  # Gaussians times pixels that the torch twin still manages, all at once
 DV_LIMIT = 2_000_000  # events: dv-processing takes them from Python one by one
 NUM_PATCHES, PATCH_SIZE = 400, 9
@@ -51,7 +53,9 @@ FLOPS_FORWARD, FLOPS_BACKWARD = 30, 48  # of a (pixel, Gaussian) pair
 FLOPS_LINEARISE = 230  # of a patch pixel: warp, two samples, two Jacobians, 2 x 27 sums
 
 Candidates = Mapping[str, Callable[[], object]]
-Scene = tuple[list[Tensor], tuple[float, float, float, float]]  # inputs of `rasterize`, intrinsics
+Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # of `rasterize`: five of Gaussians, the pose
+Render = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels
 
 
 @dataclass(frozen=True)
@@ -158,15 +162,14 @@ def _seconds(run: Callable[[], object], calls: int = 1) -> tuple[float, float]:
 
 def _finish_device() -> None:
     """Wait for what was launched; a CPU has finished already."""
-    if ti.cfg.arch == ti.cuda:
-        ti.sync()
-        torch.cuda.synchronize()
+    if is_gpu():
+        synchronize()
 
 
 # --- rasterizer ---
 
 
-def room_scene(n: int, width: int, height: int, seed: int = 0) -> Scene:
+def room_scene(n: int, width: int, height: int, seed: int = 0) -> tuple[Inputs, Intrinsics]:
     """Gaussians of about 1.2 pixels on the walls of a room 5 x 2.6 x 4.5 m, seen from its middle."""
     rng = np.random.default_rng(seed)
     focal = 0.8 * width
@@ -179,7 +182,12 @@ def room_scene(n: int, width: int, height: int, seed: int = 0) -> Scene:
     tensors = [torch.from_numpy(x.astype(np.float32)) for x in inputs]
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.02, -0.01, 0.03])
-    return [*tensors, pose], (focal, focal, width / 2, height / 2)
+    return _inputs([*tensors, pose]), (focal, focal, width / 2, height / 2)
+
+
+def _inputs(tensors: Iterable[Tensor]) -> Inputs:
+    means, quats, scales, opacities, colors, pose = tensors
+    return means, quats, scales, opacities, colors, pose
 
 
 def rasterize_pairs(
@@ -196,7 +204,7 @@ def rasterize_pairs(
         limits = torch.tensor([width - 1, height - 1])
         low = (centres - half).ceil().long().clamp_min(0)
         sides = (torch.minimum((centres + half).floor().long(), limits) - low + 1).clamp_min(0)
-        counts = sides.prod(1) * ((depths > 0.05) & (extent > 0))
+        counts = sides.prod(1) * ((depths > NEAR) & (extent > 0))
         order = depths.argsort(stable=True)
         g = order.repeat_interleave(counts[order])
         starts = counts[order].cumsum(0) - counts[order]
@@ -220,7 +228,7 @@ def rasterize_pairs(
     return image, depth[..., 0], total[..., 0]
 
 
-def count_pairs(inputs: list[Tensor], intrinsics: tuple[float, ...], size: tuple[int, int]) -> int:
+def count_pairs(inputs: Inputs, intrinsics: tuple[float, ...], size: tuple[int, int]) -> int:
     """Return how many (pixel, Gaussian) pairs the Gaussians in view have, hidden ones included."""
     means, quats, scales, opacities, _, pose = inputs
     centres, covariances, depths = reference.project(means, quats, scales, pose, intrinsics)
@@ -234,25 +242,25 @@ def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str 
     """Render a view; render it and compute all gradients, pose included."""
     inputs, intrinsics = room_scene(count, *size)
     pairs = count_pairs(inputs, intrinsics, size)
-    inputs = [x.to(device) for x in inputs]
+    inputs = _inputs(x.to(device) for x in inputs)
     cotangent = torch.randn(size[1], size[0], generator=torch.Generator().manual_seed(0)).to(device)
 
     def kernel(*tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        view = rasterize(*tensors, intrinsics, size)
+        view = rasterize(*_inputs(tensors), intrinsics, size)
         return view.image, view.depth, view.alpha
 
     def twin(*tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        view = reference.rasterize(*tensors, intrinsics, size)
+        view = reference.rasterize(*_inputs(tensors), intrinsics, size)
         return view.image, view.depth, view.alpha
 
-    def gradients(render: Callable[..., tuple[Tensor, ...]]) -> object:
-        tensors = [x.clone().requires_grad_() for x in inputs]
-        loss = sum((image.squeeze(-1) * cotangent).sum() for image in render(*tensors))
+    def gradients(render: Render) -> object:
+        tensors = _inputs(x.clone().requires_grad_() for x in inputs)
+        loss = torch.stack([(image.squeeze(-1) * cotangent).sum() for image in render(*tensors)]).sum()
         return torch.autograd.grad(loss, tensors)
 
-    renders = {OURS: kernel}
+    renders: dict[str, Render] = {OURS: kernel}
     if device == "cpu":  # the alternatives make tensors on the CPU
-        renders["torch pair list"] = lambda *x: rasterize_pairs(*x, intrinsics, size)
+        renders["torch pair list"] = lambda *x: rasterize_pairs(*_inputs(x), intrinsics, size)
         if size[0] * size[1] * count <= TWIN_LIMIT:
             renders["torch twin"] = twin
     task = f"{size[0]}x{size[1]}, {count} Gaussians"
@@ -277,10 +285,10 @@ def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row
     last = np.full((size[1], size[0]), -np.inf)
     everywhere = [rng.integers(0, n, count).astype(np.int16) for n in size]
     task = f"{size[0]}x{size[1]}, {count} events"
-    yield from _update(f"{task}: update", *everywhere, t, last, watch)
+    yield from _update(f"{task}: update", everywhere, t, last, watch)
     # Most of them in the middle, none at all in the corners
     middle = [np.clip(rng.normal(n / 2, n / 6, count), 0, n - 1).astype(np.int16) for n in size]
-    yield from _update(f"{task}, most in the middle: update", *middle, t, last, watch)
+    yield from _update(f"{task}, most in the middle: update", middle, t, last, watch)
     evaluations = {
         OURS: lambda: time_surface(last, 1.0, 0.03),
         "torch twin": lambda: reference.time_surface(torch.from_numpy(last), 1.0, 0.03),
@@ -291,14 +299,15 @@ def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row
 
 def _update(
     task: str,
-    x: np.ndarray,  # [N] int16
-    y: np.ndarray,  # [N] int16
+    places: Sequence[np.ndarray],  # x and y, [N] int16 each
     t: np.ndarray,  # [N] float64 seconds
     last: np.ndarray,  # [H, W] float64 seconds
     watch: Stopwatch,
 ) -> Iterator[Row]:
     """Take in a batch of events."""
-    size = last.shape[::-1]
+    x, y = places
+    height, width = last.shape
+    x_of_twin, y_of_twin, t_of_twin = map(torch.from_numpy, (x, y, t))
 
     def assign() -> None:
         last[y, x] = t
@@ -306,13 +315,13 @@ def _update(
     updates = {
         OURS: lambda: update_last_timestamps(x, y, t, last),
         "numpy last[y, x] = t": assign,
-        "torch twin": lambda: reference.last_timestamps(*map(torch.from_numpy, (x, y, t)), last.shape),
+        "torch twin": lambda: reference.last_timestamps(x_of_twin, y_of_twin, t_of_twin, (height, width)),
     }
     if importlib.util.find_spec("numba"):
         compiled = _numba_assignment()
         updates["numba"] = lambda: compiled(x, y, t, last)
     if watch.has_alternatives and importlib.util.find_spec("dv_processing") and len(t) <= DV_LIMIT:
-        updates["dv-processing"] = _dv_update(x, y, t, size)
+        updates["dv-processing"] = _dv_update(x, y, t, (width, height))
     newest = min(len(t), last.size)  # times that are needed
     work = Work(x.nbytes + y.nbytes + (t.itemsize + last.itemsize) * newest)
     yield from watch.compare("time_surface", task, updates, work)
@@ -346,7 +355,10 @@ def linearise_in_numpy(
     patches: Patches, surface: np.ndarray, depth: np.ndarray, T_b_a: np.ndarray,
     intrinsics: tuple[float, ...], model: ResidualModel, inverse: bool,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """H [6, 6] and g [6] of `kernels.patch_warp.normal_equations`, in numpy."""
+    """Return H [6, 6] and g [6] of `kernels.patch_warp.Alignment`, computed in numpy.
+
+    The unknown updates T_b_a <- exp(xi) T_b_a; if `inverse`, it updates T_a_b <- exp(xi) T_a_b.
+    """
     fx, fy, cx, cy = intrinsics
     T = T_b_a.astype(np.float32)
     x, y, rho = patches.pixels[patches.pixels[:, 2] > 0].T
@@ -372,7 +384,7 @@ def linearise_in_numpy(
     r_depth = p[:, 2] - d
     has_depth, highest = corners.min(1) > NEAR, corners.max(1)
     keep = ~has_depth | (np.abs(r_depth) < model.max_depth_difference)
-    is_smooth = keep & has_depth & (highest - corners.min(1) < 0.05 * highest)
+    is_smooth = keep & has_depth & (highest - corners.min(1) < MAX_SLOPE * highest)
     zero = np.zeros_like(inv_z)
     du = np.stack([fx * inv_z, zero, -fx * p[:, 0] * inv_z**2], -1)
     dv = np.stack([zero, fy * inv_z, -fy * p[:, 1] * inv_z**2], -1)
@@ -398,7 +410,8 @@ def linearise_in_torch(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """The same from the torch twin's residuals, by forward differentiation along the six twists."""
     arrays = (patches.pixels, patches.values, surface, depth)
-    inputs, T = [torch.from_numpy(array) for array in arrays], torch.from_numpy(T_b_a).float()
+    pixels, values, image, depths = map(torch.from_numpy, arrays)
+    T = torch.from_numpy(T_b_a).float()
     columns: tuple[list[Tensor], list[Tensor]] = ([], [])
     residuals: tuple[Tensor, ...] = ()
     for generator in torch.from_numpy(_GENERATORS).float():
@@ -406,7 +419,9 @@ def linearise_in_torch(
             moved = forward_ad.make_dual(T, -T @ generator if inverse else generator @ T)
             duals = [
                 forward_ad.unpack_dual(r)
-                for r in reference.alignment_residuals(*inputs, moved, intrinsics, model)
+                for r in reference.alignment_residuals(
+                    pixels, values, image, depths, moved, intrinsics, model
+                )
             ]
             residuals = tuple(dual.primal for dual in duals)
             for column, dual in zip(columns, duals):
@@ -453,6 +468,11 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
 
     def linearise(alignment: Alignment) -> object:
         forward, backward = alignment.linearise(poses)
+        if alignment.is_compositional:  # exp(xi) T = T exp(Ad(T^-1) xi)
+            forward, backward = (
+                system.transformed(np.linalg.inv(adjoint(pose)))
+                for system, pose in zip((forward, backward), poses)
+            )
         return forward + backward.transformed(-adjoint(poses[1]))
 
     arguments = [
@@ -461,7 +481,7 @@ def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
     ]
     candidates = {
         OURS: lambda: linearise(additive),
-        "Taichi, inverse compositional": lambda: linearise(compositional),
+        f"{OURS}, inverse compositional": lambda: linearise(compositional),
         "numpy": lambda: [linearise_in_numpy(*each) for each in arguments],
         "torch twin": lambda: [linearise_in_torch(*each) for each in arguments],
     }
@@ -478,6 +498,8 @@ import json, time
 def now():
     return time.perf_counter(), time.process_time()
 stamps = [now()]
+import edslam_ti.cold_start
+edslam_ti.cold_start.load_kernels()
 import edslam_ti.kernels, edslam_ti.experiments.kernel_times
 stamps.append(now())
 edslam_ti.kernels.init("cpu", threads={threads})
@@ -491,11 +513,11 @@ print(json.dumps(stamps))
 def run_every_kernel() -> None:
     """Run what a run of SLAM runs, on next to nothing: afterwards all of it is compiled."""
     inputs, intrinsics = room_scene(20, 16, 12)
-    tensors = [x.requires_grad_() for x in inputs]
-    view = rasterize(*tensors, intrinsics, (16, 12))
+    view = rasterize(*_inputs(x.requires_grad_() for x in inputs), intrinsics, (16, 12))
     (view.image.sum() + view.depth.sum()).backward()
     target, poses = torch.zeros(12, 16), torch.stack([inputs[-1]] * 2)
-    scene = [x.detach() for x in inputs[:-1]]
+    means, quats, scales, opacities, colors, _ = _inputs(x.detach() for x in inputs)
+    scene = means, quats, scales, opacities, colors
     compare_change(*scene, poses, intrinsics, (16, 12), target, 0.5, 0.01, 1.0)
     compare_view(*scene, poses[0], intrinsics, (16, 12), target, target, 0.5, 0.01, 1.0, 1.0)
     for module in (patch_warp, brightness_image, depth_average, surfaces):
@@ -512,7 +534,7 @@ def cold_start(threads: int, rounds: int) -> Iterator[Row]:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         samples.append(np.diff(json.loads(done.stdout.splitlines()[-1]), axis=0))
     parts = 1e3 * np.median(samples, axis=0)  # of three or more, as the first may have filled the cache
-    names = ("import", "start Taichi", "compile every kernel")
+    names = ("import", f"start {OURS}", "compile every kernel")
     total = parts.sum(0)
     for name, (wall, cpu) in zip(("all", *names), [total, *parts]):
         ratios = float(wall / total[0]), float(cpu / total[1])

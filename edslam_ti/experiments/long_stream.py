@@ -1,4 +1,4 @@
-"""What a long stream costs: time per frame, memory and what it holds, against the seconds of data."""
+"""The cost of a long stream: time per frame and memory, and what the memory holds, over time."""
 
 import csv
 import time
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
-from edslam_ti.mapping.gaussian_mapper import GaussianMapper
+from edslam_ti.memory import release_free_memory
 from edslam_ti.output import atomic_file
 from edslam_ti.pipeline import contrast_of, held_out_frames, make_slam
 from edslam_ti.results.pictures import new_figure, save_figure
@@ -39,7 +39,7 @@ class FrameCost:
 
 
 def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameCost]:
-    """Run the method that the settings name, without its end, and yield what every frame cost."""
+    """Run the method that the settings name, without the final optimisation, and yield every frame's cost."""
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     slam = make_slam(config, sequence, samples, contrast_of(config, sequence, samples))
     held_out = held_out_frames(samples, config.evaluation.hold_out_every)
@@ -47,6 +47,8 @@ def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameC
     for k, sample in enumerate(samples):
         tracking, mapping, cpu = slam.tracking_seconds, slam.mapping_seconds, time.process_time()
         slam.process(sample, is_held_out=k in held_out)
+        if slam.mapper is not None:
+            release_free_memory()  # as the pipeline does
         yield FrameCost(
             sample.timestamp - start,
             time.process_time() - cpu,
@@ -59,17 +61,17 @@ def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameC
 
 
 def _held_mb(slam: Slam) -> tuple[float, float, float]:
-    """Return the MB of the map, of what else the mapper keeps, and of what the tracker keeps."""
-    counted: set[int] = set()  # what two of them hold counts for the first
-    gaussians = slam.mapper.gaussians if isinstance(slam.mapper, GaussianMapper) else None
-    held = [held_bytes(part, counted) / 2**20 for part in (gaussians, slam.mapper, slam.tracker)]
+    """Return the megabytes held by the map, by the rest of the mapper, and by the tracker."""
+    counted: set[int] = set()  # memory that two of them hold counts for the first
+    the_map = None if slam.mapper is None else slam.mapper.map
+    held = [held_bytes(part, counted) / 2**20 for part in (the_map, slam.mapper, slam.tracker)]
     return held[0], held[1], held[2]
 
 
 def held_bytes(root: Any, counted: set[int]) -> int:
-    """Return the bytes of all arrays that can be reached from an object of ours, each memory once.
+    """Return the bytes of all arrays reachable from an object of this package, each memory once.
 
-    `counted`: addresses that have been counted before; those found are added. Mapped files do not count.
+    `counted`: addresses that were counted before; new ones are added. Memory-mapped files do not count.
     """
     total, waiting, visited = 0, [root], set[int]()
     while waiting:
@@ -104,8 +106,8 @@ def _newly_counted(address: int, size: int, counted: set[int]) -> int:
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Means over a few seconds of data; the most memory, and the map at their end."""
+class Window:
+    """A few seconds of data: mean time per frame, peak memory, and the map at their end."""
 
     start: float  # seconds of data
     end: float
@@ -122,13 +124,13 @@ class Stretch:
         return self.memory_mb - self.map_mb - self.frames_mb - self.tracker_mb
 
 
-def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
-    """Return the costs of every `length` seconds of data."""
+def windows(costs: Sequence[FrameCost], length: float) -> list[Window]:
+    """Return the costs over every `length` seconds of data."""
     parts: dict[int, list[FrameCost]] = {}
     for cost in costs:
         parts.setdefault(int(cost.timestamp / length), []).append(cost)
     return [
-        Stretch(
+        Window(
             k * length,
             (k + 1) * length,
             float(np.mean([c.cpu_s for c in part])),
@@ -142,8 +144,8 @@ def stretches(costs: Sequence[FrameCost], length: float) -> list[Stretch]:
     ]
 
 
-def table(rows: Sequence[Stretch]) -> str:
-    """Return Markdown: a line for every stretch, then what has grown since the warm-up.
+def table(rows: Sequence[Window]) -> str:
+    """Return Markdown: a line for every window, then what has grown since the warm-up.
 
     CPU time of all threads: wall time says more about what else the machine does.
     """
@@ -169,7 +171,7 @@ def table(rows: Sequence[Stretch]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _line(row: Stretch) -> str:
+def _line(row: Window) -> str:
     return (
         f"| {row.start:g} to {row.end:g} | {row.num_gaussians / 1000:.0f}k | {row.memory_mb:.0f} | "
         f"{row.map_mb:.1f} | {row.frames_mb:.1f} | {row.tracker_mb:.1f} | {row.other_mb:.0f} | "
@@ -177,7 +179,7 @@ def _line(row: Stretch) -> str:
     )
 
 
-def plot(path: Path, rows: Sequence[Stretch]) -> None:
+def plot(path: Path, rows: Sequence[Window]) -> None:
     """Draw time a frame, and memory with the size of the map, against seconds of data."""
     figure = new_figure(9, 3.2)
     seconds, memory = figure.subplots(1, 2)
@@ -199,7 +201,7 @@ def plot(path: Path, rows: Sequence[Stretch]) -> None:
 def measure(
     sequence: EventDepthSequence, config: Config, out: Path, length: float, report: Callable[[str], None]
 ) -> None:
-    """Run the sequence, tell the table's newest line every `length` seconds, and write what there is.
+    """Run the sequence, report the table's newest line every `length` seconds, and write the results.
 
     frames.csv, long_stream.md and long_stream.png are written when the run ends or is interrupted.
     """
@@ -207,14 +209,14 @@ def measure(
     try:
         for cost in frame_costs(sequence, config):
             if costs and int(cost.timestamp / length) > int(costs[-1].timestamp / length):
-                report(_line(stretches(costs, length)[-1]))
+                report(_line(windows(costs, length)[-1]))
             costs.append(cost)
     finally:  # what there is before Ctrl-C, too
         if costs:
-            _write(out, costs, stretches(costs, length))
+            _write(out, costs, windows(costs, length))
 
 
-def _write(out: Path, costs: Sequence[FrameCost], rows: Sequence[Stretch]) -> None:
+def _write(out: Path, costs: Sequence[FrameCost], rows: Sequence[Window]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with atomic_file(out / "frames.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)

@@ -67,13 +67,17 @@ def markdown(results: Sequence[Result], title: str) -> str:
 
 def insert_into(document: Path, name: str, text: str) -> None:
     """Replace what a Markdown document holds between `<!-- NAME -->` and `<!-- end NAME -->`."""
-    begin, end = f"<!-- {name} -->\n", f"<!-- end {name} -->"
-    old = document.read_text()
-    if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
-        raise DataError(f"{document}: expected the lines '{begin.strip()}' and '{end}' once each; add them")
-    new = old[: old.index(begin) + len(begin)] + text.rstrip("\n") + "\n" + old[old.index(end) :]
+    new = inserted(document.read_text(), name, text, document)
     with atomic_file(document) as temporary:
         temporary.write_text(new)
+
+
+def inserted(old: str, name: str, text: str, document: Path) -> str:
+    """Return the text `old` of a document with `text` between the marks of that name."""
+    begin, end = f"<!-- {name} -->\n", f"<!-- end {name} -->"
+    if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
+        raise DataError(f"{document}: expected the lines '{begin.strip()}' and '{end}' once each; add them")
+    return old[: old.index(begin) + len(begin)] + text.rstrip("\n") + "\n" + old[old.index(end) :]
 
 
 def _group_row(result: Result) -> str:

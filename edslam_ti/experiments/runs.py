@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from edslam_ti import __version__, kernels
-from edslam_ti.config import Config, read_differences
+from edslam_ti.config import Config, dataset_differences
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.datasets.altered import AlteredSequence
 from edslam_ti.errors import ConfigError, EdSlamError
-from edslam_ti.evaluation.images import trajectory_errors
+from edslam_ti.evaluation.trajectories import trajectory_errors
 from edslam_ti.experiments.cases import MEASURED, Case, Recording
 from edslam_ti.experiments.recordings import Recordings
 from edslam_ti.methods import METHODS
@@ -29,7 +29,6 @@ from edslam_ti.trajectory import Trajectory
 
 Report = Callable[[str, float], None]  # what goes on, and the share of it that is done
 Value = TypeVar("Value")
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"  # what a data set needs, as in apps/slam.py
 LONGEST_MESSAGE = 300  # characters; compilers tell long stories
 
 
@@ -60,9 +59,7 @@ def run_case(
     """
     recording = case.recording
     config = Config(method=variant.method, scene=recording.scene, seed=recording.seed, threads=threads)
-    dataset_file = CONFIGS / f"{sequence.dataset}.yaml"
-    if dataset_file.is_file():  # most data needs none
-        config = config.updated(read_differences(dataset_file))
+    config = config.updated(dataset_differences(sequence.dataset))
     config = config.updated(dict(METHODS[variant.method].overrides)).updated(variant.differences)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     slam = make_slam(config, sequence, samples, contrast_of(config, sequence, samples))

@@ -1,10 +1,8 @@
 """Steps of a whole run timed beside alternatives, and how the kernels' cost grows with their input.
 
-The kernels alone are timed in kernels/benchmark.py; here are the steps that need a map or a sequence.
+The kernels alone are timed in experiments/kernel_times.py; here are the steps that need a map or a sequence.
 """
 
-import dataclasses
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,6 +18,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.datasets import SampledSequence, open_sequence
 from edslam_ti.datasets.base import Sample
+from edslam_ti.experiments.front_end import front_end
 from edslam_ti.experiments.kernel_times import (
     OURS,
     Row,
@@ -34,17 +33,16 @@ from edslam_ti.experiments.kernel_times import (
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.view_losses import compare_change
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
-from edslam_ti.mapping.losses import brightness_change, event_loss
 from edslam_ti.mapping.rendering import render
 from edslam_ti.methods import METHODS
-from edslam_ti.output import atomic_file
 from edslam_ti.pipeline import contrast_of, make_slam
+from edslam_ti.results.pictures import new_figure, save_figure
 from edslam_ti.slam import Slam
 
 WARM_UP_FRAMES = 3
 MOTION = (0.01, 0.0, 0.005)  # metres between the two views of a mapping step
 EPSILON, BACKGROUND = 0.004, 0.5
-EVENT_FLOOR = 1e-3  # that of losses.event_loss
+EVENT_FLOOR = 1e-3  # an interval without events must not divide by zero
 
 
 def rows(
@@ -60,6 +58,8 @@ def rows(
     for size in sizes:
         for count in events if "time_surface" in suites else ():
             yield from surface(size, count, watch)
+        for count in events if "front_end" in suites else ():
+            yield from front_end(size, count, watch)
         if "tracking" in suites:
             yield from tracking(size, watch)
         for count in gaussians:
@@ -73,29 +73,34 @@ def rows(
         yield from slam(*sequence)
 
 
-def write(
-    folder: Path, machine: str, lines: Sequence[str], results: Sequence[Row], curves: Sequence["Curve"]
-) -> None:
-    """Write benchmark.md and benchmark.json into the folder, and scaling.png if there are curves."""
-    content = {
-        "machine": machine,
-        "rows": [dataclasses.asdict(row) for row in results],
-        "curves": [dataclasses.asdict(curve) | {"exponent": curve.exponent} for curve in curves],
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    with atomic_file(folder / "benchmark.md") as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
-    with atomic_file(folder / "benchmark.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
-    if curves:
-        plot_scaling(folder / "scaling.png", curves)
-
-
 # --- mapping step ---
 
 
+def brightness_change(
+    intensity_start: Tensor,  # [H, W]
+    intensity_end: Tensor,  # [H, W]
+    epsilon: float,
+) -> Tensor:  # [H, W]
+    """Return the synthesised log-brightness change, Eq. 10 of the paper."""
+    return torch.log(intensity_end + epsilon) - torch.log(intensity_start + epsilon)
+
+
+def event_loss(
+    predicted: Tensor,  # [H, W] Eq. 10
+    measured: Tensor,  # [H, W] Eq. 11
+) -> Tensor:
+    """Return the paper's Eq. 12 squared and divided by the measured mean square.
+
+    The raw loss grows with motion and interval length; divided, every interval weighs alike.
+    """
+    return (predicted - measured).square().mean() / (measured.square().mean() + EVENT_FLOOR)
+
+
 def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
-    """Two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam."""
+    """The paper's step: two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam.
+
+    The mapper compares one view (losses.py), which costs half of it.
+    """
     (means, quats, scales, _, colors, pose), intrinsics = room_scene(count, *size)
     camera = Camera(*size, *intrinsics)
     gaussians = GaussianMap(Config().mapping)
@@ -138,8 +143,8 @@ def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterato
 
     candidates = {
         OURS: in_one_pass,
-        "Taichi, two renders with gradients alone": renders,
-        "Taichi, two renders compared by torch": lambda: by_autograd(by_kernels),
+        f"{OURS}, two renders with gradients alone": renders,
+        f"{OURS}, two renders compared by torch": lambda: by_autograd(by_kernels),
         "torch pair list": lambda: by_autograd(by_pairs),
     }
     task = f"{size[0]}x{size[1]}, {count} Gaussians: mapping step"
@@ -266,13 +271,9 @@ def scaling_table(curves: Sequence[Curve]) -> list[str]:
 
 def plot_scaling(path: Path, curves: Sequence[Curve]) -> None:
     """Write a picture of all curves: a panel for each size, both axes logarithmic."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     kinds = list(dict.fromkeys(curve.against for curve in curves))
-    figure, panels = plt.subplots(1, len(kinds), figsize=(3.5 * len(kinds), 5), squeeze=False)
+    figure = new_figure(3.5 * len(kinds), 5, dpi=90)
+    panels = figure.subplots(1, len(kinds), squeeze=False)
     for kind, panel in zip(kinds, panels[0]):
         shown = [curve for curve in curves if curve.against == kind]
         for curve in shown:
@@ -287,7 +288,4 @@ def plot_scaling(path: Path, curves: Sequence[Curve]) -> None:
         panel.minorticks_off()
         panel.set_ylabel("wall ms" if kind == "threads" else "CPU ms")
         panel.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1))
-    figure.tight_layout()
-    with atomic_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=90)
-    plt.close(figure)
+    save_figure(figure, path)

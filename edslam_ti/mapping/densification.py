@@ -18,6 +18,12 @@ SHRINKING = 1.6  # by which the halves of a split Gaussian are smaller
 FAINTEST = 0.005  # opacity; opacities are reset to twice as much (gsplat: prune_opa)
 
 
+def scene_size(gaussians: GaussianMap, positions: np.ndarray) -> float:  # [F, 3] of the camera, metres
+    """Return the median distance in metres of the Gaussians from the middle of the path."""
+    means = gaussians.raw["means"].detach().numpy()
+    return float(np.median(np.linalg.norm(means - positions.mean(0), axis=1)))
+
+
 class Densifier:
     """Adds up how strongly images pull at every Gaussian, and refines the map accordingly."""
 
@@ -44,7 +50,7 @@ class Densifier:
         gradient: Tensor,  # [M, 3] of the loss in the means
         T_world_camera: Tensor,  # [4, 4]
     ) -> None:
-        """Take in one view's gradients; the number of Gaussians may have changed only by `refine`."""
+        """Add one view's gradients; the number of Gaussians may have changed only by `refine`."""
         if len(self._pull) != num_gaussians:
             self._pull, self._count = torch.zeros(num_gaussians), torch.zeros(num_gaussians)
         T = inverse(T_world_camera.detach()).float()
@@ -62,9 +68,9 @@ class Densifier:
         is_pulled = self._pull / self._count.clamp_min(1) > self._min_gradient
         largest = gaussians.raw["log_scales"].amax(1).exp()
         is_small = largest <= SMALL * self._size
-        room = max(self._most - len(gaussians), 0)
-        split = torch.nonzero(is_pulled & ~is_small).squeeze(1)[:room]
-        cloned = torch.nonzero(is_pulled & is_small).squeeze(1)[: room - len(split)]
+        remaining = max(self._most - len(gaussians), 0)
+        split = torch.nonzero(is_pulled & ~is_small).squeeze(1)[:remaining]
+        cloned = torch.nonzero(is_pulled & is_small).squeeze(1)[: remaining - len(split)]
         gaussians.clone(cloned)
         self._split(gaussians, split)
         opacity, largest = (

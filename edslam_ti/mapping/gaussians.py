@@ -98,28 +98,28 @@ class GaussianMap:
             (raw["logit_colors"] + shared.sum(-1, keepdim=True)).sigmoid(),
         )
 
-    def part(self, chosen: Tensor) -> "GaussianMap":  # [M] indices
+    def subset(self, chosen: Tensor) -> "GaussianMap":  # [M] indices
         """Return some of the Gaussians as a map of their own, to be optimised at their cost alone.
 
-        `take_over` brings back what has become of them. The cells are shared with it from the beginning.
+        `update_from` brings back what has become of them. The cells are shared with it from the beginning.
         """
-        part = copy.copy(self)
-        part._map_rows(lambda table: table.index_select(0, chosen))
-        return part
+        subset = copy.copy(self)
+        subset._map_rows(lambda table: table.index_select(0, chosen))
+        return subset
 
     def measured(self) -> "GaussianMap":
         """Return the Gaussians on measured surfaces, without those at assumed depth."""
         if bool(self._is_measured.all()):
             return self
-        return self.part(torch.nonzero(self._is_measured).squeeze(1))
+        return self.subset(torch.nonzero(self._is_measured).squeeze(1))
 
-    def take_over(self, part: "GaussianMap", chosen: Tensor) -> None:  # [M] indices, as given to `part`
-        """Overwrite the chosen Gaussians and their moments with those of a part."""
+    def update_from(self, subset: "GaussianMap", chosen: Tensor) -> None:  # [M] indices, as given to `subset`
+        """Overwrite the chosen Gaussians and their moments with those of a subset."""
         for name, value in self._raw.items():
-            value.detach().index_copy_(0, chosen, part._raw[name].detach())
-            for mine, theirs in zip(self._moments[name], part._moments[name]):
+            value.detach().index_copy_(0, chosen, subset._raw[name].detach())
+            for mine, theirs in zip(self._moments[name], subset._moments[name]):
                 mine.index_copy_(0, chosen, theirs)
-        self._steps = part._steps
+        self._steps = subset._steps
 
     def add(
         self,
@@ -168,7 +168,7 @@ class GaussianMap:
         self._map_rows(lambda table: table[mask])
 
     @torch.no_grad()
-    def follow(self, corrections: Mapping[int, np.ndarray]) -> None:  # [4, 4] by frame, T_new T_old^-1
+    def move_with_frames(self, corrections: Mapping[int, np.ndarray]) -> None:  # T_new T_old^-1 by frame
         """Move the Gaussians from every frame's depth as its pose has been moved."""
         frames = torch.tensor(sorted(corrections), dtype=torch.int64)
         chosen = torch.nonzero(torch.isin(self._frames, frames)).squeeze(1)

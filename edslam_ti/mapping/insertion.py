@@ -1,17 +1,90 @@
-"""Depth images to points (Open3D)."""
+"""New Gaussians: where depth asks for them (Eq. 13), and discs on the surfaces that it measures."""
 
-import cv2
+from dataclasses import dataclass
+
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.config import MappingConfig
+from edslam_ti.depth_images import beside_steps, is_smooth, with_holes_filled
 from edslam_ti.errors import DataError
+from edslam_ti.geometry import inverse
+from edslam_ti.mapping.budget import stride_for_budget
 from edslam_ti.open3d_loader import load_open3d
 
-HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
-FAR_SIDE = 90  # percentile of the depth around a hole
-BEHIND = 1.25  # times that is assumed in it: what is too near would hide surfaces measured later
-STEP = 0.03  # second difference of depth, as a share of it, from which neighbours are two surfaces
+FINER = 2  # times closer are new Gaussians at outlines, where a coarse one would show on both sides
+FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
+MAX_ELONGATION = 4.0  # of a new Gaussian on a surface that falls away
 FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
+
+
+@dataclass(frozen=True)
+class NewGaussians:
+    """Where Gaussians are to be added, and what they look like but for their brightness."""
+
+    means: np.ndarray  # [N, 3] float32 metres, world
+    pixels: np.ndarray  # [N, 2] int64 (x, y) that they are from
+    quats: np.ndarray  # [N, 4] float32 wxyz
+    scales: np.ndarray  # [N, 3] float32 metres
+    is_measured: np.ndarray  # [N] bool: at measured depth, not at that assumed in a hole
+
+
+def new_gaussians(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+    alpha: np.ndarray,  # [H, W] of the map seen from there
+    rendered_depth: np.ndarray,  # [H, W] metres, of that view
+    camera: Camera,
+    T_world_camera: np.ndarray,  # [4, 4]
+    count: int,  # Gaussians in the map so far
+    config: MappingConfig,
+) -> NewGaussians | None:
+    """Return Gaussians at the pixels that Eq. 13 selects, one per stride x stride block, closer at outlines.
+
+    So do pixels without depth get one where the map shows nothing, at the depth that is assumed there. None:
+    there is nothing to add, or no more may be added.
+    """
+    mask = densify_mask(alpha, rendered_depth, depth, config.min_visibility, config.depth_error_factor)
+    mask |= (depth <= 0) & (alpha < config.min_visibility)
+    is_measured, depth = depth > 0, with_holes_filled(depth)
+    stride = stride_for_budget(config.pixel_stride, count / config.max_gaussians)
+    spacing = np.where(beside_steps(depth), max(stride // FINER, 1), stride)
+    points, pixels = depth_to_points(depth, camera, T_world_camera, mask & spaced(spacing))
+    remaining = config.max_gaussians - count
+    points, pixels = points[:remaining], pixels[:remaining]
+    if len(points) == 0:
+        return None
+    x, y = pixels[:, 0], pixels[:, 1]
+    # Discs on the surface; small ones sharpen faster than large ones shrink, and Eq. 13 fills the gaps.
+    size = config.initial_size * spacing[y, x] * depth[y, x] / camera.fx
+    quats, elongation = surface_discs(depth, camera, T_world_camera, pixels, MAX_ELONGATION)
+    scales = size[:, None] * np.stack([np.ones_like(size), elongation, np.full_like(size, FLATNESS)], 1)
+    means = points.astype(np.float32)
+    return NewGaussians(means, pixels, quats, scales.astype(np.float32), is_measured[y, x])
+
+
+def densify_mask(
+    alpha: np.ndarray,  # [H, W] rendered
+    rendered_depth: np.ndarray,  # [H, W] metres
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+    min_visibility: float,  # lambda_V
+    depth_error_factor: float,  # lambda_MDE
+) -> np.ndarray:  # [H, W] bool
+    """Return the pixels where new Gaussians are needed and can be placed, Eq. 13."""
+    valid = depth > 0
+    if not valid.any():
+        return valid
+    error = np.abs(rendered_depth - depth)
+    seen = valid & (alpha >= min_visibility)
+    median_error = float(np.median(error[seen])) if seen.any() else np.inf
+    return valid & ((alpha < min_visibility) | (error > depth_error_factor * median_error))
+
+
+def spaced(
+    spacing: np.ndarray,  # [H, W] int, pixels
+) -> np.ndarray:  # [H, W] bool
+    """Return one pixel of every block that is as wide and high as the spacing."""
+    y, x = np.ogrid[: spacing.shape[0], : spacing.shape[1]]
+    return (y % spacing == spacing // 2) & (x % spacing == spacing // 2)
 
 
 def depth_to_points(
@@ -34,7 +107,7 @@ def depth_to_points(
     cloud = o3d.geometry.PointCloud.create_from_depth_image(
         o3d.geometry.Image(np.ascontiguousarray(np.where(used, depth, 0), np.float32)),
         o3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *camera.intrinsics),
-        np.linalg.inv(T_world_camera),
+        inverse(T_world_camera),
         depth_scale=1.0,
         depth_trunc=2 * FARTHEST,
     )
@@ -48,11 +121,11 @@ def surface_discs(
     camera: Camera,
     T_world_camera: np.ndarray,  # [4, 4]
     pixels: np.ndarray,  # [N, 2] int64 (x, y)
-    max_stretch: float,
+    max_elongation: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # [N, 4] float32 wxyz; [N] float32 >= 1
     """Return the orientation of discs that lie on the surface, and how much longer than wide they must be.
 
-    The third axis is the normal; a disc seen as a circle is longer by the stretch, 1 / cosine of the tilt,
+    The third axis is the normal; a disc seen as a circle is longer by the elongation, 1 / cosine of the tilt,
     along the second axis. Where depth is missing beside a pixel, or jumps, the disc faces the camera.
     """
     from scipy.spatial.transform import Rotation
@@ -71,43 +144,8 @@ def surface_discs(
     first = _unit(np.where(faces_camera, np.cross(normal, [0.0, 1.0, 0.0]), first))
     axes = np.stack([first, np.cross(normal, first), normal], -1)
     x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3] @ axes).as_quat().T
-    stretch = 1 / np.maximum(cosine, 1 / max_stretch)
-    return np.stack([w, x, y, z], -1).astype(np.float32), stretch.astype(np.float32)
-
-
-def beside_steps(
-    depth: np.ndarray,  # [H, W] metres, 0 = missing
-) -> np.ndarray:  # [H, W] bool
-    """Return the pixels beside which depth jumps or ends: outlines, but no slanted surface."""
-    padded = np.pad(depth, 1, mode="reflect", reflect_type="odd")  # goes on as it does
-    across = padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * depth
-    down = padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * depth
-    return np.maximum(np.abs(across), np.abs(down)) > STEP * depth
-
-
-def with_holes_filled(
-    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
-) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
-    """Return depth with large holes put behind the far side of what surrounds them.
-
-    A sensor sees nothing in windows and beyond its range; something is there all the same, and it is not in
-    front. Narrow holes (shadows of the sensor's projector, noise at edges) stay: another view sees them.
-    """
-    missing = (depth <= 0).astype(np.uint8)
-    holes = cv2.morphologyEx(missing, cv2.MORPH_OPEN, np.ones((HOLE_WIDTH, HOLE_WIDTH), np.uint8))
-    filled = depth.copy()
-    number, labels, boxes, _ = cv2.connectedComponentsWithStats(holes)
-    reach = 2 * (HOLE_WIDTH // 2) + 1  # beyond what opening has removed of the rim
-    for label in range(1, number):
-        left, top, width, height, _ = boxes[label]
-        box = np.s_[max(top - reach, 0) : top + height + reach, max(left - reach, 0) : left + width + reach]
-        hole = (labels[box] == label).astype(np.uint8)
-        near = cv2.dilate(hole, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-        around = depth[box][near & (depth[box] > 0)]
-        if len(around):
-            gap = near & (depth[box] <= 0)
-            filled[box][gap] = BEHIND * np.percentile(around, FAR_SIDE)
-    return filled
+    elongation = 1 / np.maximum(cosine, 1 / max_elongation)
+    return np.stack([w, x, y, z], -1).astype(np.float32), elongation.astype(np.float32)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:  # [N, 3]
@@ -119,9 +157,9 @@ def _differences(points: np.ndarray, depth: np.ndarray, axis: int) -> np.ndarray
     result = np.zeros_like(points)
     inner, before, after = ([slice(None), slice(None)] for _ in range(3))
     inner[axis], before[axis], after[axis] = slice(1, -1), slice(None, -2), slice(2, None)
-    a, b, c = (depth[tuple(part)] for part in (before, inner, after))
-    is_smooth = (a > 0) & (b > 0) & (c > 0) & (np.abs(a + c - 2 * b) < 0.02 * b)
-    result[tuple(inner)] = np.where(is_smooth[..., None], points[tuple(after)] - points[tuple(before)], 0)
+    a, b, c = (depth[tuple(where)] for where in (before, inner, after))
+    goes_on = is_smooth(a, b, c)
+    result[tuple(inner)] = np.where(goes_on[..., None], points[tuple(after)] - points[tuple(before)], 0)
     return result
 
 

@@ -1,33 +1,55 @@
-"""What the map is optimised for: events, depth and the shape of its Gaussians (Eq. 10-12, 14-16)."""
+"""What the map is optimised for: brightness, depth and the shape of its Gaussians (Eq. 12, 14, 15, 16).
 
-import torch
-from torch import Tensor
+The paper compares two renders with the change of brightness measured between them (Eq. 10 to 12). Here the
+image at the beginning of that change is known (event_images/solve.py), so that one render is compared with
+that image plus the change: the same residual with one of its two views put in.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor, zeros_like
 
 from edslam_ti.camera import Camera
+from edslam_ti.config import MappingConfig
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.view_losses import Comparison, compare_view
-from edslam_ti.mapping.gaussians import Gaussians
+from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
+
+# Squared log brightness, by which the mean square of Eq. 12 is divided: the event loss of a map of one
+# brightness is then in the order of 1. With lambda_event = 1 the bare mean square thus weighs 10 times.
+BRIGHTNESS_VARIANCE = 0.1
 
 
-def brightness_change(
-    intensity_start: Tensor,  # [H, W]
-    intensity_end: Tensor,  # [H, W]
-    epsilon: float,
-) -> Tensor:  # [H, W]
-    """Return the synthesised log-brightness change, Eq. 10."""
-    return torch.log(intensity_end + epsilon) - torch.log(intensity_start + epsilon)
+@dataclass(frozen=True)
+class MapLoss:
+    """Eq. 16 for one view."""
+
+    total: Tensor  # differentiable in the map and the pose
+    event: float  # Eq. 12 divided by BRIGHTNESS_VARIANCE, unweighted
+    difference: np.ndarray  # [H, W] log brightness of the map less that of the image
 
 
-def event_loss(
-    predicted: Tensor,  # [H, W] Eq. 10
-    measured: Tensor,  # [H, W] Eq. 11
-) -> Tensor:
-    """Return Eq. 12 squared and divided by the measured mean square.
-
-    The raw loss grows with motion and interval length; divided, every interval weighs alike.
-    """
-    floor = 1e-3  # an interval without events must not divide by zero
-    return (predicted - measured).square().mean() / (measured.square().mean() + floor)
+def map_loss(
+    gaussians: GaussianMap,
+    camera: Camera,
+    T_world_camera: Tensor,  # [4, 4]
+    log_brightness: Tensor,  # [H, W] log(brightness + epsilon)
+    depth: Tensor | None,  # [H, W] metres, 0 = missing
+    config: MappingConfig,
+) -> MapLoss:
+    """Return Eq. 16: lambda_event Eq. 12 / variance + lambda_d Eq. 15 + lambda_reg Eq. 14."""
+    view = view_loss(
+        gaussians.activated(), camera, T_world_camera, log_brightness, depth,
+        config.background, config.log_epsilon,
+        (config.event_weight / BRIGHTNESS_VARIANCE, config.depth_weight),
+    )  # fmt: skip
+    total = view.loss
+    if config.scale_weight > 0:
+        log_scales = gaussians.raw["log_scales"]
+        total = total + config.scale_weight * scale_loss(log_scales, config.max_scale_ratio)
+    event = float(view.difference.square().mean()) / BRIGHTNESS_VARIANCE
+    return MapLoss(total, event, view.difference.numpy())
 
 
 def view_loss(
@@ -38,11 +60,16 @@ def view_loss(
     depth: Tensor | None,  # [H, W] metres, 0 = missing
     background: float,  # brightness behind everything
     epsilon: float,
-    weights: tuple[float, float],  # of the mean square of the first, and of `depth_loss`
+    weights: tuple[float, float],  # of Eq. 12 and of Eq. 15
 ) -> Comparison:
-    """Return how much a view differs in brightness and depth, with all gradients in one pass."""
+    """Return how much a view differs in brightness (Eq. 12) and depth (Eq. 15), with gradients in one pass.
+
+    Eq. 12 is the mean over all pixels of the squared difference of log brightness. Eq. 15 is the mean over
+    pixels with depth of |rendered - alpha * measured|, the rendered depth being weighted by alpha (Eq. 8).
+    Not |rendered - measured|: 1 % of transparency, 3 m away, would count as 3 cm and pull every surface back.
+    """
     if depth is None or weights[1] == 0:
-        depth = torch.zeros_like(log_brightness)
+        depth = zeros_like(log_brightness)
     num_measured = max(int((depth > 0).sum()), 1)
     return compare_view(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors,
@@ -50,19 +77,6 @@ def view_loss(
         log_brightness, depth, background, epsilon,
         weights[0] / log_brightness.numel(), weights[1] / num_measured,
     )  # fmt: skip
-
-
-def depth_loss(
-    rendered: Tensor,  # [H, W] metres, weighted by alpha (Eq. 8)
-    alpha: Tensor,  # [H, W]
-    measured: Tensor,  # [H, W] metres, 0 = missing
-) -> Tensor:
-    """Return the mean absolute depth error over measured pixels, metres, Eq. 15, weighted by alpha.
-
-    Not |rendered - measured|: 1 % of transparency, 3 m away, would count as 3 cm and pull every surface back.
-    """
-    valid = measured > 0
-    return (rendered - alpha * measured).abs()[valid].mean() if bool(valid.any()) else rendered.sum() * 0
 
 
 def scale_loss(

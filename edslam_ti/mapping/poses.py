@@ -1,19 +1,26 @@
-"""Frames without depth aligned to the map: the Gauss-Newton half of bundle adjustment by turns.
+"""Poses and the map: corrected together with it, aligned to it, and followed by it (Sec. III-E).
 
-Between depth images the tracker has one keyframe's brightness and a motion prior to go by. The map has seen
-the same surfaces in all frames: its errors are as large, but others, so that half way between is better
-than either. Where a frame has depth, the tracker is the better of the two.
+Bundle adjustment by turns: poses descend with the map (`PoseRefiner`), and those of frames without depth are
+aligned to it once (`MapAligner`). Between depth images the tracker has one keyframe's brightness and a motion
+prior to go by. The map has seen the same surfaces in all frames: its errors are as large but independent, so
+half way between is better than either. Where a frame has depth, the tracker is the better of the two.
 """
 
 from dataclasses import replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, linearised, residual_model
 from edslam_ti.camera import Camera
-from edslam_ti.config import TrackingConfig
-from edslam_ti.geometry import is_near, se3_exp, se3_log
+from edslam_ti.config import MappingConfig, TrackingConfig
+from edslam_ti.geometry import inverse, is_near, orthonormalized, se3_exp, se3_log
 from edslam_ti.kernels.patch_warp import Patches
+from edslam_ti.mapping.gaussians import GaussianMap
+from edslam_ti.mapping.rendering import render_map
+from edslam_ti.mapping.targets import EventImages
+from edslam_ti.trajectory import Trajectory
 
 OPAQUE = 0.9  # alpha from which a pixel of the map's view is a surface
 SPACING = 2  # pixels between those that are aligned, in either direction
@@ -22,12 +29,77 @@ FARTHEST = (0.02, 2.0)  # metres, degrees: a larger correction is not believed
 SHARE = 0.5  # of a correction that is made: the tracker's errors and the map's are as large, and independent
 
 
+class PoseMemory:
+    """The poses that a map has been built from, to be compared with corrected ones."""
+
+    def __init__(self) -> None:
+        self._poses = np.zeros((0, 4, 4))
+
+    def remember(self, trajectory: Trajectory) -> None:
+        """Keep a copy of all poses as they are."""
+        self._poses = trajectory.poses
+
+    def corrections(self, trajectory: Trajectory) -> dict[int, np.ndarray]:  # [4, 4] by frame
+        """Return by what poses differ from those remembered, T_new T_old^-1, of frames that do differ."""
+        poses, old = trajectory.poses, self._poses
+        differ = np.flatnonzero((poses[: len(old)] != old).any((1, 2)))
+        return {int(k): poses[k] @ inverse(old[k]) for k in differ}
+
+
+class PoseRefiner:
+    """Adam on twists of individual poses: T <- T exp(step), moments kept per frame."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self._first: dict[int, np.ndarray] = {}
+        self._second: dict[int, np.ndarray] = {}
+        self._count: dict[int, int] = {}
+
+    def step(self, index: int, gradient: np.ndarray, trajectory: Trajectory) -> None:
+        """Move pose `index` of the trajectory against the gradient [6] of its twist."""
+        n = self._count[index] = self._count.get(index, 0) + 1
+        first = self._first[index] = 0.9 * self._first.get(index, 0.0) + 0.1 * gradient
+        second = self._second[index] = 0.99 * self._second.get(index, 0.0) + 0.01 * gradient**2
+        update = -self.rate * (first / (1 - 0.9**n)) / (np.sqrt(second / (1 - 0.99**n)) + 1e-12)
+        moved = trajectory.pose(index) @ se3_exp(torch.from_numpy(update)).numpy()
+        trajectory.replace(index, orthonormalized(moved))
+
+
+class StepPose:
+    """A pose for one step of optimisation, T exp(delta) with delta = 0, along which it may descend."""
+
+    def __init__(self, trajectory: Trajectory, index: int, is_free: bool) -> None:
+        """`is_free`: to be optimised; the first frame never is, it is the gauge."""
+        self.index = index
+        self.T_world_camera = torch.from_numpy(trajectory.pose(index))  # [4, 4]
+        self._delta: Tensor | None = None
+        if is_free and index != 0:
+            self._delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+            self.T_world_camera = self.T_world_camera @ se3_exp(self._delta)
+
+    @property
+    def gradient(self) -> np.ndarray | None:  # [6]
+        """The loss's gradient in the twist, after `backward`; None for a pose that is fixed."""
+        return None if self._delta is None or self._delta.grad is None else self._delta.grad.numpy()
+
+
 class MapAligner:
     """Corrects poses by comparing images with what the map shows there."""
 
-    def __init__(self, camera: Camera, config: TrackingConfig) -> None:
+    def __init__(self, camera: Camera, tracking: TrackingConfig, mapping: MappingConfig) -> None:
         self._camera = camera
-        self._model = replace(residual_model(config, config.brightness_sigma), depth_weight=0.0)
+        self._config = mapping
+        self._model = replace(residual_model(tracking, tracking.brightness_sigma), depth_weight=0.0)
+
+    def align(self, trajectory: Trajectory, images: EventImages, gaussians: GaussianMap) -> None:
+        """Correct the poses of frames without depth by the map."""
+        for k in images.frames:
+            if images.depth(k) is None:
+                T = trajectory.pose(k)
+                view = render_map(gaussians, self._camera, T, self._config.background)
+                seen = np.log(view.intensity.numpy() + self._config.log_epsilon)
+                depth, alpha = view.expected_depth.numpy(), view.alpha.numpy()
+                trajectory.replace(k, self.corrected(images.log_brightness(k), seen, depth, alpha, T))
 
     def corrected(
         self,

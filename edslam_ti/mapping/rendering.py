@@ -1,6 +1,6 @@
 """Views of a Gaussian map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -9,7 +9,6 @@ from torch import Tensor
 from edslam_ti.camera import Camera
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels import culling
-from edslam_ti.kernels.projection import LOW_PASS
 from edslam_ti.kernels.rasterization import rasterize
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
 
@@ -47,10 +46,8 @@ def render(
     camera: Camera,
     T_world_camera: Tensor,  # [4, 4]
     background: float,  # brightness behind everything
-    reduction: int = 1,  # render at 1 / reduction of the camera's size
 ) -> RenderOutput:
-    """Return the map seen from a pose (Eq. 6-8), at full size or as the mean of blocks of pixels."""
-    at_size = camera if reduction == 1 else camera.downscaled(reduction)
+    """Return the map seen from a pose (Eq. 6-8)."""
     drawn = rasterize(
         gaussians.means,
         gaussians.quats,
@@ -58,9 +55,8 @@ def render(
         gaussians.opacities,
         gaussians.colors,
         inverse(T_world_camera).float(),
-        at_size.intrinsics,
-        (at_size.width, at_size.height),
-        low_pass=reduced_low_pass(reduction),
+        camera.intrinsics,
+        (camera.width, camera.height),
     )
     intensity = drawn.image[..., 0] + (1 - drawn.alpha) * background
     return RenderOutput(intensity, drawn.depth, drawn.alpha, drawn.visible, drawn.dominant)
@@ -78,10 +74,22 @@ def drawable(
     return culling.drawable(raw["means"], raw["log_scales"], T_camera_world, camera.intrinsics, size)
 
 
-def reduced_low_pass(reduction: int) -> float:
-    """Return the filter, in reduced px^2, that blurs like the full-size one and averages the blocks."""
-    block_variance = (reduction**2 - 1) / 12
-    return (LOW_PASS + block_variance) / reduction**2
+@torch.no_grad()
+def render_map(
+    gaussians: GaussianMap,  # of N
+    camera: Camera,
+    T_world_camera: np.ndarray,  # [4, 4]
+    background: float,
+) -> RenderOutput:
+    """Return the map seen from a pose, without gradients; what is out of view costs nothing."""
+    T = torch.from_numpy(T_world_camera)
+    chosen = drawable(gaussians, camera, T)
+    view = render(gaussians.activated(chosen), camera, T, background)
+    visible = torch.zeros(len(gaussians), dtype=torch.bool)
+    visible[chosen] = view.visible
+    # Indices of the subset to those of the map; -1, the last one here, stays -1.
+    of_map = torch.cat([chosen, torch.tensor([-1])]).int()
+    return replace(view, visible=visible, dominant=of_map[view.dominant.long()])
 
 
 @torch.no_grad()

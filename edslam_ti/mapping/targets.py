@@ -1,36 +1,35 @@
-"""Images from events: the start image of a stretch of a few seconds, and what has changed since (Eq. 11).
+"""What views of the map are compared with: a start image, and what events say has changed since (Eq. 11).
 
-Grey images, where they are taken in, too, are such images themselves and tell what the start image is.
+The start image is that of a window of a few seconds of events. Grey images, where given, are such images
+themselves and tell what the start image is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
+from edslam_ti.depth_images import block_means, with_holes_filled
+from edslam_ti.event_images.change import ChangeArchive
 from edslam_ti.event_images.contrast import ContrastThreshold
+from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.event_images.sharp import SharpImage, SharpImages
-from edslam_ti.event_images.start_image import EventView, block_means, solve_start_image
-from edslam_ti.events import Events
+from edslam_ti.event_images.solve import EventView, solve_start_image
 from edslam_ti.frame import Frame
-from edslam_ti.mapping.insertion import with_holes_filled
-from edslam_ti.mapping.keyframes import EventArchive
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
 QUICK = {4: 60}  # iterations of the solution by reduction of the images, during the run
 THOROUGH = {4: 100, 2: 80}  # the same at the end
-GIVEN_VIEWS = 6  # frames of earlier stretches that a start image is tied to
-DETAIL_SIGMA = 4.0  # px; smaller details of the start image come from the map
-DETAIL_RATE = 0.1  # share of a view's difference that they take over
-HOT = 10.0  # times the median of a pixel's neighbours: it fires by itself
-HOT_EVENTS = 100  # fewer do not make a pixel hot
+GIVEN_VIEWS = 6  # frames of earlier windows that a start image is tied to
+DETAIL_SIGMA = 4.0  # px; smaller details of the start image are learned from renders
+DETAIL_RATE = 0.1  # share of a render's difference by which they move
 
 
 @dataclass
-class _Stretch:
+class _Window:
     """Frames whose changes count from one start image."""
 
     first: int  # frame
@@ -38,10 +37,10 @@ class _Stretch:
 
 
 class EventImages:
-    """Log brightness at the times of frames, as events, depth and poses tell it.
+    """Log brightness at the times of frames, reconstructed from events, depth and poses.
 
-    The start image is solved for every stretch, so that errors of the events (noise, a wrong threshold)
-    do not pile up, and tied to frames of earlier stretches. The absolute level is unknown unless grey
+    The start image is solved for every window, so that errors of the events (noise, a wrong threshold)
+    do not pile up, and tied to frames of earlier windows. The absolute level is unknown unless grey
     images tell it.
     """
 
@@ -57,14 +56,12 @@ class EventImages:
         self._contrast_threshold = contrast.value
         self._config = config
         self._sharp_images = sharp_images
-        self._archive = EventArchive(camera.shape, *contrast.relative)
+        self._archive = ChangeArchive(camera.shape, *contrast.relative)
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
-        self._stretches: list[_Stretch] = []
-        self._num_events = np.zeros(camera.shape, np.float32)
-        # Pixels that fire by themselves; neighbours stand in for them.
-        self.hot = np.zeros(camera.shape, bool)
-        self._started = -np.inf  # time of the current stretch's first frame
+        self._windows: list[_Window] = []
+        self.noisy_pixels = NoisyPixels(camera.shape)
+        self._started = -np.inf  # time of the current window's first frame
 
     @property
     def frames(self) -> list[int]:
@@ -73,65 +70,65 @@ class EventImages:
 
     @property
     def newest_frames(self) -> list[int]:
-        """Frames of the newest stretch."""
-        return [k for k in self.frames if self._stretch(k) is self._stretches[-1]]
+        """Frames of the newest window."""
+        return [k for k in self.frames if self._window_of(k) is self._windows[-1]]
 
     def depth(self, index: int) -> np.ndarray | None:
         """Return a frame's measured depth [H, W] in metres, 0 = missing."""
         return self._depths[index]
 
-    def append(self, frame: Frame, index: int) -> None:
+    def add(self, frame: Frame, index: int) -> None:
         """Add a frame's events, and its image unless the frame is held out."""
-        self._archive.append(frame.events, index, is_kept=not frame.is_held_out)
-        self._find_hot_pixels(frame.events)
+        self._archive.add(frame.event_counts, index, is_kept=not frame.is_held_out)
+        self.noisy_pixels.add(frame.event_counts)
         if not frame.is_held_out:
             self._depths[index] = frame.depth
-            self._take_in_grey(frame, index)
-        if not self._stretches:
+            self._add_grey(frame, index)
+        if not self._windows:
             level = np.float32(np.log(self._config.background))
             self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
         elif frame.timestamp - self._started > self._config.stretch:
-            change = self._contrast_threshold * self._archive.begin_again()
-            self._begin(index + 1, frame.timestamp, self._stretches[-1].start + change)
+            change = self._contrast_threshold * self._archive.reset()
+            self._begin(index + 1, frame.timestamp, self._windows[-1].start + change)
 
     def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
         """Return the image at a frame, with what its grey image says where it has one."""
-        image = self._stretch(index).start + self._change(index)
+        image = self._window_of(index).start + self._change(index)
         return self._grey[index].imposed_on(image) if index in self._grey else image
 
     def solve(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
         """Solve the newest start image (thorough: all of them); return whether there was enough to do so."""
-        stretches = self._stretches if is_thorough else self._stretches[-1:]
+        windows = self._windows if is_thorough else self._windows[-1:]
         iterations = THOROUGH if is_thorough else QUICK
-        for stretch in stretches:
-            own = [k for k in self.frames if self._stretch(k) is stretch]
-            given = [k for k in self.frames if k < stretch.first][-GIVEN_VIEWS:] if self.is_solved else []
+        for window in windows:
+            own = [k for k in self.frames if self._window_of(k) is window]
+            given = [k for k in self.frames if k < window.first][-GIVEN_VIEWS:] if self.is_solved else []
             if not own or len(own) + len(given) < MIN_VIEWS:
                 continue
             chosen = evenly(own, self._config.solved_views)
             views = [self._view(k, trajectory, is_relative=k in chosen) for k in given + chosen]
-            solved = solve_start_image(views, self._camera, stretch.start, iterations)
+            solved = solve_start_image(views, self._camera, window.start, iterations)
             if not given:  # nothing says what the level is: let it be as it was
-                change = (solved.log_brightness - stretch.start)[solved.is_observed]
+                change = (solved.log_brightness - window.start)[solved.is_observed]
                 solved.log_brightness[:] -= np.median(change) if len(change) else np.float32(0)
-            stretch.start = solved.log_brightness
-            self._tie_to_grey(stretch, own)
+            window.start = solved.log_brightness
+            self._tie_to_grey(window, own)
             self.is_solved = True
         return self.is_solved
 
-    def take_over_details(self, index: int, difference: np.ndarray) -> None:
-        """Move details of a start image towards the map's, which has seen them from many sides.
+    def learn_detail_from_render(self, index: int, difference: np.ndarray) -> None:
+        """Move details of a frame's start image towards a render: the map has seen them from many sides.
 
-        `difference` [H, W]: log brightness of the map less the image at the frame. Grey images have their
-        own details.
+        `difference` [H, W]: log brightness of the render less the image at the frame. Larger structures stay:
+        the solution knows them better. At a frame with a grey image all stays: that has its own details.
         """
         if index in self._grey:
             return
         details = difference - cv2.GaussianBlur(difference, (0, 0), DETAIL_SIGMA)
-        stretch = self._stretch(index)
-        stretch.start = stretch.start + DETAIL_RATE * details
+        window = self._window_of(index)
+        window.start = window.start + DETAIL_RATE * details
 
-    def set_white(self, brightness: float) -> float:
+    def set_white_level(self, brightness: float) -> float:
         """Shift all images so that the brightest percent is at `brightness`; return the shift in log.
 
         Where grey images tell the level, it stays.
@@ -140,12 +137,12 @@ class EventImages:
             return 0.0
         small = [block_means(self.log_brightness(k), 4) for k in self.frames]
         shift = float(np.log(brightness + self._config.log_epsilon) - np.percentile(small, 99))
-        for stretch in self._stretches:
-            stretch.start = stretch.start + np.float32(shift)
+        for window in self._windows:
+            window.start = window.start + np.float32(shift)
         return shift
 
-    def thin_out(self, keep: set[int]) -> None:
-        """Forget frames beyond the largest number kept: where they are densest, those of `keep` last.
+    def drop_surplus(self, keep: set[int]) -> None:
+        """Drop frames above the limit, from the densest part of the path first; those of `keep` go last.
 
         The newer half stays complete.
         """
@@ -153,51 +150,43 @@ class EventImages:
             older = range(1, max(2, len(frames) // 2))
             candidates = [i for i in older if frames[i] not in keep] or list(older)
             densest = min(candidates, key=lambda i: frames[i + 1] - frames[i - 1])
-            self._archive.forget(frames[densest])
+            self._archive.drop(frames[densest])
             del self._depths[frames[densest]]
             self._grey.pop(frames[densest], None)
-            in_use = {self._stretch(k).first for k in self.frames}
-            self._stretches = [s for s in self._stretches[:-1] if s.first in in_use] + self._stretches[-1:]
+            in_use = {self._window_of(k).first for k in self.frames}
+            self._windows = [s for s in self._windows[:-1] if s.first in in_use] + self._windows[-1:]
 
-    def _take_in_grey(self, frame: Frame, index: int) -> None:
+    def _add_grey(self, frame: Frame, index: int) -> None:
         grey = None if self._sharp_images is None else self._sharp_images.at(frame)
         if grey is not None:
-            grey.log_brightness[self.hot] = cv2.medianBlur(grey.log_brightness, 5)[self.hot]
-            self._grey[index] = grey
+            without_noise = self.noisy_pixels.replaced(grey.log_brightness)
+            self._grey[index] = replace(grey, log_brightness=without_noise)
 
-    def _tie_to_grey(self, stretch: _Stretch, frames: list[int]) -> None:
+    def _tie_to_grey(self, window: _Window, frames: list[int]) -> None:
         """Shift a start image to what the grey images of its frames say, pixel by pixel where they do."""
         total, count = np.zeros(self._camera.shape, np.float32), np.zeros(self._camera.shape, np.float32)
         for k in frames:
             if k in self._grey:
                 is_exact = self._grey[k].clipped == 0
-                shift = self._grey[k].log_brightness - (stretch.start + self._change(k))
+                shift = self._grey[k].log_brightness - (window.start + self._change(k))
                 total += np.where(is_exact, shift, np.float32(0))
                 count += is_exact
         if count.any():
             known = total[count > 0] / count[count > 0]
             shift = np.full_like(total, np.median(known))
             shift[count > 0] = known
-            stretch.start = stretch.start + shift
+            window.start = window.start + shift
 
     def _begin(self, first: int, time: float, start: np.ndarray) -> None:
-        self._stretches.append(_Stretch(first, start.astype(np.float32)))
+        self._windows.append(_Window(first, start.astype(np.float32)))
         self._started = time
 
-    def _stretch(self, index: int) -> _Stretch:
-        return next(s for s in reversed(self._stretches) if s.first <= index)
+    def _window_of(self, index: int) -> _Window:
+        return next(s for s in reversed(self._windows) if s.first <= index)
 
     def _change(self, index: int) -> np.ndarray:
         change = np.float32(self._contrast_threshold) * self._archive.change(index)
-        if self.hot.any():
-            change[self.hot] = cv2.medianBlur(change, 5)[self.hot]
-        return change
-
-    def _find_hot_pixels(self, events: Events) -> None:
-        pixel = events.y.astype(np.int64) * self._camera.width + events.x
-        self._num_events.ravel()[:] += np.bincount(pixel, minlength=self._num_events.size)
-        around = cv2.medianBlur(self._num_events, 5)
-        self.hot = self._num_events > np.maximum(HOT * around, HOT_EVENTS)
+        return self.noisy_pixels.replaced(change)
 
     def _view(self, index: int, trajectory: Trajectory, is_relative: bool) -> EventView:
         change = self._change(index) if is_relative else self.log_brightness(index)
@@ -211,3 +200,23 @@ def evenly(frames: list[int], most: int) -> list[int]:
     if len(frames) <= most:
         return frames
     return [frames[int(k)] for k in np.linspace(0, len(frames) - 1, most)]
+
+
+class FrameSampler:
+    """Draws the frames that steps of optimisation are for."""
+
+    def __init__(self, random: np.random.Generator, num_recent: int) -> None:
+        self._random = random
+        self._num_recent = num_recent
+        self._order: list[int] = []  # frames still to come in this round
+
+    def recent(self, frames: list[int]) -> int:
+        """Draw a frame, half of the time one of the newest."""
+        pool = frames[-self._num_recent :] if self._random.random() < 0.5 else frames
+        return pool[int(self._random.integers(len(pool)))]
+
+    def any(self, frames: list[int]) -> int:
+        """Draw a frame, each once before any comes again."""
+        if not self._order:
+            self._order = list(self._random.permutation(frames))
+        return int(self._order.pop())

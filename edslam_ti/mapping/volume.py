@@ -7,31 +7,11 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
 from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.ray_casting import RayCaster, pixel_rays
 
 BLOCK = 8  # voxels along the side of one hashed block
 TRUNCATION_VOXELS = 4.0  # distances are kept up to this many voxels from the surface
-EDGE_STEP = 0.05  # relative difference of neighbouring depths from which they are two surfaces
 FIRST_CAPACITY = 4000  # blocks, 10 kB each; Open3D grows the table by itself
-
-
-def without_depth_edges(
-    depth: np.ndarray,  # [H, W] metres, 0 = missing
-    relative_step: float = EDGE_STEP,
-) -> np.ndarray:  # [H, W] metres
-    """Return depth without the pixels on both sides of a step to a neighbour.
-
-    Rendered depth is a mean over what a pixel covers: at an outline it lies between two surfaces, where
-    fusion would leave a skirt.
-    """
-    edge = np.zeros(depth.shape, bool)
-    for a, b, at_a, at_b in (
-        (depth[:-1], depth[1:], edge[:-1], edge[1:]),
-        (depth[:, :-1], depth[:, 1:], edge[:, :-1], edge[:, 1:]),
-    ):
-        step = np.abs(a - b) > relative_step * np.minimum(a, b)
-        at_a |= step
-        at_b |= step
-    return np.where(edge, 0, depth)
 
 
 class TsdfVolume:
@@ -108,31 +88,21 @@ class TsdfVolume:
 
 
 class MeshView:
-    """A mesh to be looked at: ray casting, which needs neither display nor OpenGL."""
+    """Views of an Open3D TriangleMesh by ray casting, which needs neither display nor OpenGL."""
 
     def __init__(self, mesh: Any) -> None:
-        o3d = load_open3d()
         self._triangles = np.asarray(mesh.triangles)  # [T, 3]
         self._brightness = np.asarray(mesh.vertex_colors).reshape(-1, 3).mean(1)  # [V]
-        self._scene = o3d.t.geometry.RaycastingScene()
-        if len(self._triangles):
-            self._scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+        self._caster = RayCaster.of_mesh(mesh)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return brightness and depth [H, W] (metres, 0 = no surface) seen from a pose."""
-        if not len(self._triangles):
-            return np.zeros(camera.shape, np.float32), np.zeros(camera.shape, np.float32)
-        o3d = load_open3d()
-        directions = camera.rays() @ T_world_camera[:3, :3].T  # [H, W, 3] with z = 1: t is the depth
-        origins = np.broadcast_to(T_world_camera[:3, 3], directions.shape)
-        rays = np.concatenate([origins, directions], -1).astype(np.float32)
-        hits = self._scene.cast_rays(o3d.core.Tensor(rays))
-        depth = hits["t_hit"].numpy()
-        seen = np.isfinite(depth)
-        corners = self._triangles[hits["primitive_ids"].numpy()[seen]]  # [N, 3]
-        u, v = hits["primitive_uvs"].numpy()[seen].T  # weights of the second and the third corner
-        weights = np.stack([1 - u - v, u, v], -1)  # [N, 3]
+        hits = self._caster.cast(pixel_rays(camera, T_world_camera))
         brightness = np.zeros(camera.shape, np.float32)
         if len(self._brightness):
+            seen = np.isfinite(hits.distance)
+            corners = self._triangles[hits.triangle[seen]]  # [N, 3]
+            u, v = hits.uv[seen].T
+            weights = np.stack([1 - u - v, u, v], -1)  # [N, 3]
             brightness[seen] = (self._brightness[corners] * weights).sum(-1)
-        return brightness, np.where(seen, depth, 0).astype(np.float32)
+        return brightness, hits.depth

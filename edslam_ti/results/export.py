@@ -1,4 +1,4 @@
-"""What a run leaves behind for other programs: Gaussian splats, points and a mesh, all as PLY."""
+"""What a run leaves behind for other programs: points and a mesh, as PLY."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,88 +8,10 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
+from edslam_ti.mapping.gaussian_ply import three_channels
 from edslam_ti.mapping.volume import TsdfVolume
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.output import atomic_file
-
-SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc
-
-# The layout of Kerbl et al. 2023. Viewers look properties up by name; f_rest_* (higher harmonics) may be
-# absent, and the normals, always zero, are kept because some readers skip by position.
-SPLAT_PROPERTIES = (
-    *("x", "y", "z", "nx", "ny", "nz"),
-    *("f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2"),
-    *("rot_0", "rot_1", "rot_2", "rot_3"),
-)
-
-
-def write_gaussian_ply(
-    path: Path,
-    means: np.ndarray,  # [N, 3] metres, world
-    quats: np.ndarray,  # [N, 4] wxyz
-    log_scales: np.ndarray,  # [N, 3] log metres
-    logit_opacities: np.ndarray,  # [N]
-    colors: np.ndarray,  # [N], [N, 1] or [N, 3] brightness in [0, 1]
-) -> None:
-    """Write Gaussians in the 3DGS layout that splat viewers open (binary little endian, float32)."""
-    count = len(means)
-    if count == 0:
-        raise DataError(f"{path.name}: the map holds no Gaussians; was there any depth to map?")
-    parts = {
-        "means": (means, 3),
-        "quats": (quats, 4),
-        "log_scales": (log_scales, 3),
-        "logit_opacities": (np.reshape(logit_opacities, (-1, 1)), 1),
-        "colors": (_three_channels(colors), 3),
-    }
-    for name, (values, width) in parts.items():
-        if values.shape != (count, width):
-            raise DataError(f"{name}: expected shape {(count, width)}, got {values.shape}")
-        if not np.isfinite(values).all():
-            raise DataError(f"{name}: expected finite values; {path.name} is not written")
-    table = np.zeros(count, dtype=[(name, "<f4") for name in SPLAT_PROPERTIES])
-    columns = [means, np.zeros((count, 3)), (parts["colors"][0] - 0.5) / SH_C0]
-    columns += [parts["logit_opacities"][0], log_scales, quats / np.linalg.norm(quats, axis=1, keepdims=True)]
-    for name, column in zip(SPLAT_PROPERTIES, np.concatenate(columns, axis=1).T):
-        table[name] = column
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for name in SPLAT_PROPERTIES] + ["end_header", ""]
-    with atomic_file(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(table.tobytes())
-
-
-def read_gaussian_ply(path: Path) -> dict[str, np.ndarray]:
-    """Return means, quats, log_scales, logit_opacities and colors ([N, 3]) of a splat file as float32."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found")
-    data = path.read_bytes()
-    header, marker, body = data.partition(b"end_header\n")
-    lines = header.decode("ascii", "replace").splitlines()
-    if not marker or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
-        raise DataError(f"{path}: expected a binary little endian PLY file")
-    properties = [line.split() for line in lines if line.startswith("property ")]
-    names = [words[-1] for words in properties]
-    missing = [name for name in SPLAT_PROPERTIES if name not in names and name not in ("nx", "ny", "nz")]
-    if missing or any(words[1] not in ("float", "float32") for words in properties):
-        raise DataError(f"{path}: expected float properties of the 3DGS layout, missing {missing}")
-    dtype = np.dtype([(name, "<f4") for name in names])
-    counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
-    if len(counts) != 1 or not counts[0].isdigit() or len(body) < int(counts[0]) * dtype.itemsize:
-        raise DataError(f"{path}: truncated; expected {counts} vertices of {dtype.itemsize} bytes")
-    table = np.frombuffer(body, dtype, count=int(counts[0]))
-
-    def columns(*wanted: str) -> np.ndarray:
-        return np.stack([table[name] for name in wanted], -1)
-
-    return {
-        "means": columns("x", "y", "z"),
-        "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        "log_scales": columns("scale_0", "scale_1", "scale_2"),
-        "logit_opacities": table["opacity"].copy(),
-        "colors": 0.5 + SH_C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
-    }
 
 
 def write_points(
@@ -104,7 +26,7 @@ def write_points(
         raise DataError(f"colors: expected one per point ({len(points)}), got {len(colors)}")
     o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
-    cloud.colors = o3d.utility.Vector3dVector(np.clip(_three_channels(colors), 0, 1).astype(np.float64))
+    cloud.colors = o3d.utility.Vector3dVector(np.clip(three_channels(colors), 0, 1).astype(np.float64))
     with atomic_file(path) as temporary:
         if not o3d.io.write_point_cloud(str(temporary), cloud):
             raise DataError(
@@ -132,8 +54,3 @@ def write_mesh(path: Path, mesh: Any) -> None:
     with atomic_file(path) as temporary:
         if not o3d.io.write_triangle_mesh(str(temporary), mesh):
             raise DataError(f"{path}: Open3D could not write this mesh; check the folder and the suffix")
-
-
-def _three_channels(colors: np.ndarray) -> np.ndarray:  # [N], [N, 1] or [N, 3] -> [N, 3]
-    columns = colors.reshape(len(colors), -1)
-    return np.repeat(columns, 3, axis=1) if columns.shape[1] == 1 else columns

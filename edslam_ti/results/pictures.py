@@ -1,4 +1,4 @@
-"""Pictures of rendered views without a display: rows beside the truth, the contact sheet, a fly-through."""
+"""Pictures of rendered views without a display: comparisons with the truth, contact sheets, a fly-through."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from edslam_ti.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-GAP, HEAD, CAPTION = 6, 34, 20  # pixels between panels, above all of them, above each row
+GAP, HEAD, CAPTION = 6, 34, 20  # pixels: between panels, above the sheet, above each row
 LETTER = 8  # pixels, height and about the width of letters
 LARGEST_ERROR = 0.25  # brightness at the end of the error's colour scale
 SMOOTHING = 0.1  # seconds, Gaussian width over which the fly-through's path is smoothed
@@ -27,11 +27,11 @@ SMOOTHING = 0.1  # seconds, Gaussian width over which the fly-through's path is 
 
 @dataclass(frozen=True)
 class PictureRow:
-    """A rendered view and what there is to compare it with."""
+    """A rendered view and the truth, where it is known."""
 
     caption: str
     truth: np.ndarray | None  # [H, W] brightness in [0, 1]
-    render: np.ndarray  # [H, W] brightness; what lies outside [0, 1] is clipped
+    render: np.ndarray  # [H, W] brightness, clipped to [0, 1]
     depth: np.ndarray  # [H, W] metres, 0 = nothing drawn
 
 
@@ -104,7 +104,7 @@ def _coloured(values: np.ndarray, colours: int) -> np.ndarray:  # [H, W] in [0, 
     return np.asarray(cv2.applyColorMap(_bytes(values), colours))[..., ::-1]
 
 
-def _bytes(image: np.ndarray) -> np.ndarray:  # -> uint8; what lies outside [0, 1] is clipped
+def _bytes(image: np.ndarray) -> np.ndarray:  # [...] -> uint8, clipped to [0, 1]
     return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
 
 
@@ -158,7 +158,7 @@ def smooth_path(
 def fly_through_frames(
     views: Iterable[tuple[np.ndarray, np.ndarray]],  # brightness and depth [H, W] of every frame
 ) -> Iterator[np.ndarray]:  # [H, 2 W, 3] uint8
-    """Yield render and depth side by side; the first frame sets the depth's colours."""
+    """Yield render and depth side by side; the first frame with depth sets the colour scale."""
     near = far = 0.0
     for intensity, depth in views:
         if far == 0.0 and (depth > 0).any():
@@ -187,7 +187,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
 
 def new_figure(width: float, height: float, dpi: int = 120) -> "Figure":
-    """Return a figure (inches) that belongs to nobody: no pyplot, so no display and no leak."""
+    """Return a figure (inches) that is not registered with pyplot: it needs no display and is freed."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=dpi, layout="constrained")

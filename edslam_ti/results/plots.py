@@ -1,8 +1,5 @@
-"""Seeing a run: plots of trajectories and maps (matplotlib, no display) and an Open3D window."""
+"""Plots of trajectories, comparisons and finished runs (matplotlib, no display)."""
 
-import json
-import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edslam_ti.camera import Camera
-from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.evaluation.images import trajectory_errors
-from edslam_ti.mapping.gaussian_mapper import GaussianMapper
-from edslam_ti.mapping.mapper import Mapper
+from edslam_ti.camera import NEAREST, Camera
+from edslam_ti.errors import DataError
+from edslam_ti.evaluation.trajectories import trajectory_errors
 from edslam_ti.mapping.volume import MeshView
-from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.results.pictures import new_figure, save_figure
-from edslam_ti.trajectory import Trajectory, read_tum
+from edslam_ti.results.reading import Result, load_result
+from edslam_ti.trajectory import Trajectory
+from edslam_ti.viewer import frustum_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,7 +23,6 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 START, END = "#009E73", "#D55E00"
 MAX_DRAWN_POINTS = 60_000
-MAP_EVERY = 5  # the window fetches the map points at every n-th frame
 
 
 # ---------------------------------------------------------------- trajectories
@@ -58,7 +53,7 @@ def align_to_truth(estimate: Trajectory, truth: Trajectory | None) -> AlignedPat
         return AlignedPath(positions, unknown)
     try:
         compared = trajectory_errors(estimate, truth)
-    except DataError:  # too few poses to compare: there is something to draw all the same
+    except DataError:  # too few poses to compare: the path is drawn without errors
         return AlignedPath(positions, unknown)
     unknown[compared.indices] = compared.errors_cm / 100
     T = compared.T_truth_estimate
@@ -87,7 +82,7 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
             if ax is axes[-1]:
                 figure.colorbar(bar, ax=list(axes), label="position error [cm]", fraction=0.03, pad=0.02)
         else:
-            for (name, aligned), color in zip(paths.items(), _colours()):
+            for (name, aligned), color in zip(paths.items(), colours()):
                 _draw_path(ax, aligned.positions, view, color=color, label=_with_ate(name, aligned))
         first = next(iter(paths.values())).positions
         _mark_ends(ax, first, view)
@@ -169,11 +164,11 @@ def _with_ate(name: str, aligned: AlignedPath) -> str:
 
 
 def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]], label: str) -> None:
-    """Draw every value of every series as a dot, group beside group, and each series' median as a bar."""
+    """Draw each value as a dot, grouped, and the median of each series in each group as a bar."""
     series = list(dict.fromkeys(name for values in groups.values() for name in values))
     figure = new_figure(max(5.0, 1.0 + 1.4 * len(groups)), 4.0)
     ax = figure.add_subplot()
-    for k, (name, colour) in enumerate(zip(series, _colours())):
+    for k, (name, colour) in enumerate(zip(series, colours())):
         shift = 0.8 * ((k + 0.5) / len(series) - 0.5)
         for place, values in enumerate(groups.values()):
             shown = values.get(name, [])
@@ -192,10 +187,10 @@ def plot_groups(path: Path, groups: Mapping[str, Mapping[str, Sequence[float]]],
 
 
 def plot_drift(path: Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """Draw the error (cm) over the path travelled (m) of each curve, the first poses laid together."""
+    """Draw each curve's error (cm) over the path travelled (m), with the first poses aligned."""
     figure = new_figure(7.0, 4.0)
     ax = figure.add_subplot()
-    for (name, (travelled, error)), colour in zip(curves.items(), _colours()):
+    for (name, (travelled, error)), colour in zip(curves.items(), colours()):
         ax.plot(travelled, error, color=colour, label=name, lw=1)
     ax.set_xlabel("path travelled [m]")
     ax.set_ylabel("distance from the truth [cm]")
@@ -205,64 +200,6 @@ def plot_drift(path: Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) 
 
 
 # ---------------------------------------------------------------- finished runs
-
-
-@dataclass(frozen=True)
-class Result:
-    """What can be shown of a results folder; parts a run did not make are None."""
-
-    folder: Path
-    trajectory: Trajectory
-    truth: Trajectory | None
-    metrics: dict[str, Any]
-    points: np.ndarray | None  # [N, 3] metres
-    brightness: np.ndarray | None  # [N]
-    mesh: Any | None  # open3d TriangleMesh
-
-    @property
-    def title(self) -> str:
-        """Scene, method and ATE, as far as metrics.json tells, else the folder's name."""
-        words = [str(self.metrics[key]) for key in ("scene", "method") if self.metrics.get(key)]
-        ate = self.metrics.get("ate_rmse_cm")
-        name = " ".join(words) or self.folder.name
-        return name if ate is None else f"{name}: ATE {ate:.2f} cm rmse"
-
-
-def load_result(folder: Path) -> Result:
-    """Read a results folder; it must hold `trajectory_tum.txt`, all else is optional."""
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: results folder not found")
-    trajectory_path = folder / "trajectory_tum.txt"
-    if not trajectory_path.is_file():
-        raise DataError(
-            f"{folder}: not a results folder (no trajectory_tum.txt); give one that apps/slam.py made"
-        )
-    truth_path, metrics_path = folder / "truth_tum.txt", folder / "metrics.json"
-    try:
-        metrics = json.loads(metrics_path.read_text()) if metrics_path.is_file() else {}
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{metrics_path}: not readable as JSON ({error})") from error
-    points = brightness = mesh = None
-    o3d = load_open3d()
-    if (folder / "points.ply").is_file():
-        cloud = o3d.io.read_point_cloud(str(folder / "points.ply"))
-        if not len(cloud.points):
-            raise DataError(f"{folder / 'points.ply'}: expected a point cloud, could not read any point")
-        points = np.asarray(cloud.points)
-        brightness = np.asarray(cloud.colors).mean(1) if cloud.has_colors() else np.full(len(points), 0.5)
-    if (folder / "mesh.ply").is_file():
-        mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
-        if not len(mesh.triangles):
-            raise DataError(f"{folder / 'mesh.ply'}: expected a mesh, could not read any triangle")
-    return Result(
-        folder=folder,
-        trajectory=read_tum(trajectory_path),
-        truth=read_tum(truth_path) if truth_path.is_file() else None,
-        metrics=metrics,
-        points=points,
-        brightness=brightness,
-        mesh=mesh,
-    )
 
 
 def draw_results(results: Sequence[Path], path: Path) -> None:
@@ -281,7 +218,7 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
         _draw_points(ax, runs, view)
         if truth is not None:
             _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
-        for run, color in zip(runs, _colours()):
+        for run, color in zip(runs, colours()):
             _draw_path(ax, run.trajectory.poses[:, :3, 3], view, color=color, label=run.title, linewidth=2)
         _mark_ends(ax, runs[0].trajectory.poses[:, :3, 3], view)
         _finish_axes(ax, view)
@@ -291,8 +228,8 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
 
 
 def _draw_points(ax: "Axes", runs: Sequence[Result], view: _PlanarView) -> None:
-    """Draw the map points of every run that has some, in their brightness."""
-    ax.set_facecolor("#dfe5ec")  # bright points show, too
+    """Draw the map points of every run that has any, in their brightness."""
+    ax.set_facecolor("#dfe5ec")  # so that bright points are visible
     for run in runs:
         if run.points is None or run.brightness is None:
             continue
@@ -314,14 +251,14 @@ def _draw_overview(ax: "Axes", runs: Sequence[Result]) -> None:
     elif shown.points is not None and shown.brightness is not None:
         _splat_points(image, shown.points, shown.brightness, camera, T_world_view)
     ax.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
-    for run, color in zip(runs, _colours()):
+    for run, color in zip(runs, colours()):
         pixels, depth = _project(run.trajectory.poses[:, :3, 3], camera, T_world_view)
-        pixels[depth < 0.05] = np.nan
+        pixels[depth < NEAREST] = np.nan
         ax.plot(*pixels.T, color=color, linewidth=2)
         for T in run.trajectory.poses[:: max(1, len(run.trajectory) // 6)]:
             for line in frustum_lines(T, camera, size=0.08):
                 corners, line_depth = _project(line, camera, T_world_view)
-                if (line_depth > 0.05).all():
+                if (line_depth > NEAREST).all():
                     ax.plot(*corners.T, color=color, linewidth=0.7)
     what = "mesh" if shown.mesh is not None else "points" if shown.points is not None else "no map"
     ax.set(xlim=(0, camera.width - 1), ylim=(camera.height - 1, 0), xticks=[], yticks=[])
@@ -339,9 +276,10 @@ def _project(points: np.ndarray, camera: Camera, T_world_view: np.ndarray) -> tu
     """Return pixels [N, 2] and depths [N] of world points [N, 3]; pixels behind the view are NaN."""
     T = np.linalg.inv(T_world_view)
     p = points @ T[:3, :3].T + T[:3, 3]
-    z = np.where(p[:, 2] > 1e-6, p[:, 2], np.nan)
-    pixels = np.stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy], -1)
-    return pixels, p[:, 2]
+    u, v, depth = camera.project(p)
+    pixels = np.stack([u, v], -1)
+    pixels[depth <= 0] = np.nan
+    return pixels, depth
 
 
 def _splat_points(
@@ -355,159 +293,12 @@ def _splat_points(
     pixels, depth = _project(points, camera, T_world_view)
     with np.errstate(invalid="ignore"):
         inside = (
-            (depth > 0.05) & (pixels >= 0).all(1) & (pixels < (camera.width - 2, camera.height - 2)).all(1)
+            (depth > NEAREST) & (pixels >= 0).all(1) & (pixels < (camera.width - 2, camera.height - 2)).all(1)
         )
     order = np.flatnonzero(inside)[np.argsort(-depth[inside])]
     x, y = pixels[order].astype(int).T
     for dy, dx in np.ndindex(2, 2):
         image[y + dy, x + dx] = brightness[order]
-
-
-# ---------------------------------------------------------------- the window
-
-
-class StubViewer:
-    """Shows nothing; the interface of `Viewer`."""
-
-    def update(self, trajectory: Trajectory, mapper: Mapper | None, camera: Camera) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-def check_display() -> None:
-    """Raise EdSlamError where no window can be opened."""
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
-        raise EdSlamError(
-            "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); run without "
-            "--visualize, and draw finished runs with: python apps/view.py RESULT --save FILE.png"
-        )
-
-
-class Viewer:
-    """An Open3D window that follows a run: trajectory, keyframe frusta and map points."""
-
-    def __init__(self, title: str = "ED-SLAM") -> None:
-        """Open the window, or raise EdSlamError where that is impossible."""
-        check_display()
-        self._o3d = o3d = load_open3d()
-        self._window = o3d.visualization.Visualizer()
-        if not self._window.create_window(window_name=title, width=1280, height=720):
-            raise EdSlamError("Open3D could not open a window (no OpenGL?); run without --visualize")
-        self._path = o3d.geometry.LineSet()
-        self._frusta = o3d.geometry.LineSet()
-        self._cloud = o3d.geometry.PointCloud()
-        self._shown: list[Any] = []
-        self._num_updates = 0
-
-    def update(self, trajectory: Trajectory, mapper: Mapper | None, camera: Camera) -> None:
-        """Show the state of the run and return at once."""
-        if len(trajectory) < 2:
-            return
-        fill_lines(self._o3d, self._path, path_lines(trajectory.poses[:, :3, 3]), COLOURS[0])
-        keyframes = [trajectory.pose(k) for k in _keyframe_indices(mapper, len(trajectory))]
-        frusta = [line for T in [*keyframes, trajectory.pose(-1)] for line in frustum_lines(T, camera)]
-        fill_lines(self._o3d, self._frusta, frusta, COLOURS[1])
-        shapes = [self._path, self._frusta]
-        if mapper is not None and self._num_updates % MAP_EVERY == 0:
-            points, brightness = mapper.points()
-            if len(points):
-                fill_cloud(self._o3d, self._cloud, points, brightness)
-                shapes.append(self._cloud)
-        self._num_updates += 1
-        for shape in shapes:
-            if any(shape is shown for shown in self._shown):
-                self._window.update_geometry(shape)
-            else:
-                self._window.add_geometry(shape, reset_bounding_box=True)
-                self._shown.append(shape)
-                self._look_along(trajectory.pose(0))
-        self._window.poll_events()
-        self._window.update_renderer()
-
-    def close(self) -> None:
-        """Take the window away."""
-        self._window.destroy_window()
-
-    def _look_along(self, T_world_camera: np.ndarray) -> None:
-        control = self._window.get_view_control()
-        control.set_front(-T_world_camera[:3, 2])  # from the scene to the eye
-        control.set_up(-T_world_camera[:3, 1])
-        control.set_zoom(0.4)
-
-
-def _keyframe_indices(mapper: Mapper | None, num_frames: int) -> list[int]:
-    """Return the frames a map is built on; every tenth for a map without keyframes."""
-    if isinstance(mapper, GaussianMapper):
-        return [keyframe.index for keyframe in mapper.keyframes]
-    return list(range(0, num_frames, 10))
-
-
-def show_results(results: Sequence[Path]) -> None:
-    """Show finished runs in an Open3D window until it is closed."""
-    runs = [load_result(folder) for folder in results]
-    check_display()
-    o3d = load_open3d()
-    shapes: list[Any] = []
-    for run, color in zip(runs, _colours()):
-        path = o3d.geometry.LineSet()
-        lines = path_lines(run.trajectory.poses[:, :3, 3])
-        every = max(1, len(run.trajectory) // 30)
-        camera = Camera(width=4, height=3, fx=3.0, fy=3.0, cx=1.5, cy=1.0)
-        lines += [line for T in run.trajectory.poses[::every] for line in frustum_lines(T, camera)]
-        fill_lines(o3d, path, lines, color)
-        shapes.append(path)
-        if run.mesh is not None:
-            run.mesh.compute_vertex_normals()
-            shapes.append(run.mesh)
-        elif run.points is not None and run.brightness is not None:
-            cloud = o3d.geometry.PointCloud()
-            fill_cloud(o3d, cloud, run.points, run.brightness)
-            shapes.append(cloud)
-    o3d.visualization.draw_geometries(shapes, window_name="; ".join(run.title for run in runs))
-
-
-def path_lines(positions: np.ndarray) -> list[np.ndarray]:  # [F, 3] -> F - 1 lines [2, 3]
-    """Return the segments of a path."""
-    return [positions[k : k + 2] for k in range(len(positions) - 1)]
-
-
-def frustum_lines(T_world_camera: np.ndarray, camera: Camera, size: float = 0.05) -> list[np.ndarray]:
-    """Return the eight edges [2, 3] of a camera's pyramid, `size` metres deep."""
-    columns, rows = (-0.5, camera.width - 0.5), (-0.5, camera.height - 0.5)
-    corners = np.array(
-        [
-            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]
-            for u, v in (
-                (columns[0], rows[0]),
-                (columns[1], rows[0]),
-                (columns[1], rows[1]),
-                (columns[0], rows[1]),
-            )
-        ]
-    )  # [4, 3]
-    apex = T_world_camera[:3, 3]
-    base = size * corners @ T_world_camera[:3, :3].T + apex
-    return [np.stack([base[k], base[(k + 1) % 4]]) for k in range(4)] + [np.stack([apex, b]) for b in base]
-
-
-def fill_lines(o3d: Any, shape: Any, lines: Sequence[np.ndarray], color: str) -> None:
-    """Set an Open3D LineSet to lines [2, 3] of one colour."""
-    from matplotlib.colors import to_rgb
-
-    shape.points = o3d.utility.Vector3dVector(np.concatenate(lines))
-    shape.lines = o3d.utility.Vector2iVector(np.arange(2 * len(lines), dtype=np.int32).reshape(-1, 2))
-    shape.paint_uniform_color(to_rgb(color))
-
-
-def fill_cloud(o3d: Any, cloud: Any, points: np.ndarray, brightness: np.ndarray) -> None:
-    """Set an Open3D PointCloud to points [N, 3] in grey [N]."""
-    cloud.points = o3d.utility.Vector3dVector(np.asarray(points, np.float64))
-    grey = np.clip(np.reshape(brightness, (-1, 1)), 0, 1)
-    cloud.colors = o3d.utility.Vector3dVector(np.repeat(grey, 3, axis=1).astype(np.float64))
 
 
 # ---------------------------------------------------------------- matplotlib
@@ -519,6 +310,7 @@ def _legend(ax: "Axes") -> None:
     ax.legend(list(unique.values()), list(unique), fontsize=8, framealpha=0.8)
 
 
-def _colours() -> Iterator[str]:
+def colours() -> Iterator[str]:
+    """Yield COLOURS again and again."""
     while True:
         yield from COLOURS

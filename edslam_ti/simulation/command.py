@@ -1,4 +1,4 @@
-"""What `apps/simulate.py` does: a built-in room or a mesh, a path, and a recording of both."""
+"""What `edslam simulate` does: a built-in room or a mesh, a path, and a recording of both."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

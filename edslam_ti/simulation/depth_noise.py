@@ -6,6 +6,7 @@ Axial noise after Nguyen et al. 2012, quantised disparity after Handa et al. 201
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.depth_images import beside_edges
 
 MIN_DEPTH, MAX_DEPTH = 0.4, 5.0  # metres
 DISPARITY_STEP = 1 / 351.3  # 1/metre: inverse depth is quantised to this (2.8 mm at 1 m, 11 mm at 2 m)
@@ -31,7 +32,7 @@ def kinect_depth(
     jitter = rng.normal(0, LATERAL_DEVIATION, (2, height, width))
     row = np.clip(np.rint(v + jitter[0]), 0, height - 1).astype(int)
     column = np.clip(np.rint(u + jitter[1]), 0, width - 1).astype(int)
-    edge = _edges(depth)
+    edge = beside_edges(depth, EDGE_STEP)
     z = np.where(edge, depth[row, column], depth).astype(np.float64)  # surfaces inside keep their pixel
 
     sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
@@ -54,11 +55,8 @@ def viewing_cosine(
 
     Tangents are differences to the neighbour that is nearer in depth, so that steps do not tilt surfaces.
     """
-    height, width = camera.shape
-    v, u = np.mgrid[0:height, 0:width]
-    z = depth.astype(np.float64)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(z)], -1)
-    points = rays * z[..., None]  # [H, W, 3]
+    rays = camera.rays()
+    points = rays * depth.astype(np.float64)[..., None]  # [H, W, 3]
     tangents = []
     for axis in (1, 0):
         forward = np.diff(points, axis=axis, append=np.take(points, [-1], axis))
@@ -70,19 +68,3 @@ def viewing_cosine(
     lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
     cosine = np.abs((normals * rays).sum(-1)) / np.maximum(lengths, 1e-12)
     return np.where(depth > 0, cosine, 0.0)
-
-
-def _edges(depth: np.ndarray) -> np.ndarray:  # [H, W] bool
-    """Return pixels beside a depth step (both sides of it)."""
-    edge = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        a = depth[:-1] if axis == 0 else depth[:, :-1]
-        b = depth[1:] if axis == 0 else depth[:, 1:]
-        step = np.abs(a - b) > EDGE_STEP * np.minimum(a, b)
-        if axis == 0:
-            edge[:-1] |= step
-            edge[1:] |= step
-        else:
-            edge[:, :-1] |= step
-            edge[:, 1:] |= step
-    return edge

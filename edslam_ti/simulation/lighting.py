@@ -1,11 +1,10 @@
 """Baked light: soft shadows of area lamps and ambient occlusion, one small light map per quad."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.ray_casting import RayCaster
 from edslam_ti.simulation.scene import LightMaps, SceneBuilder
 
 SPACING = 0.09  # metres between light-map texels of large quads
@@ -31,14 +30,11 @@ def bake(builder: SceneBuilder, lamps: list[Lamp], ambient: float, brightness: f
 
     They are scaled so that the mean over all surfaces is `brightness`, and bright spots are rolled off.
     """
-    o3d = load_open3d()
     rng = np.random.default_rng(seed)
     plain = builder.build("")
-    scene = o3d.t.geometry.RaycastingScene()
     # Self-luminous quads are the lamps and windows: they cast no shadow.
     dark = np.array([not q.material.luminous for q in builder.quads])
-    triangles = plain.triangles[dark[plain.surfaces]]
-    scene.add_triangles(o3d.core.Tensor(plain.vertices), o3d.core.Tensor(np.ascontiguousarray(triangles)))
+    scene = RayCaster(plain.vertices, plain.triangles[dark[plain.surfaces]])
 
     shapes, points, normals = [], [], []
     for q in builder.quads:
@@ -52,9 +48,9 @@ def bake(builder: SceneBuilder, lamps: list[Lamp], ambient: float, brightness: f
         shapes.append((h, w))
     P, N = np.concatenate(points), np.concatenate(normals)  # [M, 3]
 
-    light = ambient * _openness(o3d, scene, P, N, rng)
+    light = ambient * _openness(scene, P, N, rng)
     for lamp in lamps:
-        light += _direct(o3d, scene, P, N, lamp, rng)
+        light += _direct(scene, P, N, lamp, rng)
     counts = np.array([h * w for h, w in shapes])
     areas = np.array([np.linalg.norm(np.cross(q.u, q.v)) * (not q.material.luminous) for q in builder.quads])
     weights = np.repeat(areas / counts, counts)
@@ -65,7 +61,7 @@ def bake(builder: SceneBuilder, lamps: list[Lamp], ambient: float, brightness: f
 
 
 def _openness(
-    o3d: Any, scene: Any, points: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+    scene: RayCaster, points: np.ndarray, normals: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """Return the cosine-weighted share of nearby directions that are free, [M] in [0, 1]."""
     # Cosine-distributed directions: a point on the unit sphere added to the normal.
@@ -76,13 +72,12 @@ def _openness(
         d = normals + 0.999 * direction
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         rays = np.concatenate([points, d], 1).astype(np.float32)
-        hit = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
-        free += np.minimum(hit / AMBIENT_REACH, 1.0)
+        free += np.minimum(scene.cast(rays).distance / AMBIENT_REACH, 1.0)
     return free / AMBIENT_SAMPLES
 
 
 def _direct(
-    o3d: Any, scene: Any, points: np.ndarray, normals: np.ndarray, lamp: Lamp, rng: np.random.Generator
+    scene: RayCaster, points: np.ndarray, normals: np.ndarray, lamp: Lamp, rng: np.random.Generator
 ) -> np.ndarray:
     """Return the light of one lamp at each point with soft shadows, [M]."""
     total = np.zeros(len(points))
@@ -95,6 +90,6 @@ def _direct(
         cosines = np.maximum((unit * normals).sum(1), 0) * np.maximum(-(unit @ np.array(lamp.normal)), 0)
         lit = np.flatnonzero(cosines > 1e-4)
         rays = np.concatenate([points[lit], d[lit]], 1).astype(np.float32)
-        hit = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.002, tfar=0.98).numpy()
-        total[lit] += np.where(hit, 0.0, cosines[lit] / np.maximum(distance2[lit], 0.05))
+        blocked = scene.is_blocked(rays, near=0.002, far=0.98)
+        total[lit] += np.where(blocked, 0.0, cosines[lit] / np.maximum(distance2[lit], 0.05))
     return lamp.power * total / LAMP_SAMPLES

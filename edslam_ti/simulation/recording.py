@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from edslam_ti.camera import Camera
+from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
 from edslam_ti.output import atomic_folder, check_replaceable, write_npy_header
@@ -220,13 +220,10 @@ class _FrameTimes:
         v, u, z = v[z > 0], u[z > 0], z[z > 0]
         if len(z) == 0:
             return 0.0
-        points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
+        points = camera.back_project_pixels(u, v, z)
         T = np.linalg.inv(self._path.pose(end / 1e9)) @ self._path.pose(start / 1e9)
-        moved = points @ T[:3, :3].T + T[:3, 3]
-        ahead = np.maximum(moved[:, 2], 0.05)
-        du = camera.fx * moved[:, 0] / ahead + camera.cx - u
-        dv = camera.fy * moved[:, 1] / ahead + camera.cy - v
-        return float(np.percentile(np.hypot(du, dv), 95))
+        later_u, later_v, _ = camera.project(points @ T[:3, :3].T + T[:3, 3], NEAREST)
+        return float(np.percentile(np.hypot(later_u - u, later_v - v), 95))
 
 
 class EventFileWriter:

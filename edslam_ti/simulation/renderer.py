@@ -10,7 +10,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.kernels.texture import mark_edges, pixel_rays, shade, write_sample_means
-from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.ray_casting import Hits, RayCaster
 from edslam_ti.simulation.scene import Scene
 
 EDGE_CONTRAST = 0.02  # Michelson contrast between neighbouring surfaces from which an edge is refined
@@ -38,12 +38,9 @@ class Renderer:
     def __init__(
         self, scene: Scene, camera: Camera, samples_per_edge_pixel: int = 6, background: float = 0.5
     ) -> None:
-        o3d = load_open3d()
-        self._tensor = o3d.core.Tensor
         self.camera = camera
         self.background = background
-        self._rays = o3d.t.geometry.RaycastingScene()
-        self._rays.add_triangles(self._tensor(scene.vertices), self._tensor(scene.triangles))
+        self._caster = RayCaster(scene.vertices, scene.triangles)
         self._triangles = scene.triangle_table()
         self._textures = scene.texture_table()
         self._pixels = np.arange(camera.width * camera.height, dtype=np.int32)
@@ -53,37 +50,34 @@ class Renderer:
     def render(self, T_world_camera: np.ndarray) -> Render:  # [4, 4]
         """Return image and depth from a pose; pixel centres at integer coordinates."""
         shape = self.camera.shape
-        rays, hit, grey, surface = self._cast(T_world_camera, self._pixels, self._centre, 1.0)
+        rays, hits, grey, surface = self._cast(T_world_camera, self._pixels, self._centre, 1.0)
         edges = mark_edges(grey.reshape(shape), surface.reshape(shape), EDGE_CONTRAST)
         refine = np.flatnonzero(edges).astype(np.int32)
         if len(refine) and len(self._offsets) > 1:
             scale = 1.0 / np.sqrt(len(self._offsets))
             _, _, samples, _ = self._cast(T_world_camera, refine, self._offsets, scale)
             write_sample_means(samples.reshape(len(refine), -1), refine, grey)
-        distance = hit["t_hit"].numpy()
-        depth = np.where(np.isfinite(distance), distance, 0).astype(np.float32)
-        normals = hit["primitive_normals"].numpy()
-        return Render(grey.reshape(shape), depth.reshape(shape), rays[:, 3:], normals)
+        return Render(grey.reshape(shape), hits.depth.reshape(shape), rays[:, 3:], hits.normal)
 
-    def _cast(  # type: ignore[no-untyped-def]
+    def _cast(
         self, T_world_camera: np.ndarray, pixels: np.ndarray, offsets: np.ndarray, scale: float
-    ):
+    ) -> tuple[np.ndarray, Hits, np.ndarray, np.ndarray]:
         """Return rays, hits, grey and surface of len(pixels) * len(offsets) rays."""
         rays = pixel_rays(T_world_camera, self.camera.intrinsics, self.camera.width, pixels, offsets)
-        hit = self._rays.cast_rays(self._tensor(rays))
+        hits = self._caster.cast(rays)
         R = T_world_camera[:3, :3]
         steps = np.stack([R[:, 0] / self.camera.fx, R[:, 1] / self.camera.fy]) * scale
         grey, surface = shade(
             rays,
-            hit["t_hit"].numpy(),
-            hit["primitive_ids"].numpy(),
-            hit["primitive_uvs"].numpy(),
+            hits.distance,
+            hits.triangle,
+            hits.uv,
             steps,
             self._triangles,
             self._textures,
             self.background,
         )
-        return rays, hit, grey, surface
+        return rays, hits, grey, surface
 
 
 def _sample_offsets(count: int) -> np.ndarray:  # [S, 2] float32

@@ -1,13 +1,15 @@
 """Settings of a simulated recording."""
 
 import reprlib
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError
 
-from edslam_ti.camera import Camera
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError
+
+if TYPE_CHECKING:  # it loads numpy, which options need not wait for
+    from edslam_ti.camera import Camera
 
 DAY = 86400.0  # seconds, the longest recording
 Stretch = tuple[Annotated[float, Field(ge=0, le=DAY)], Annotated[float, Field(ge=0, le=DAY)]]
@@ -76,7 +78,9 @@ class SimulationConfig(Stage):
             raise ConfigError(f"{name}: {problem['msg']}, got {reprlib.repr(problem['input'])}") from error
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> "Camera":
         """The pinhole camera, principal point in the middle of the image."""
+        from edslam_ti.camera import Camera
+
         f = self.focal_length or 0.5 * self.width
         return Camera(self.width, self.height, f, f, (self.width - 1) / 2, (self.height - 1) / 2)

@@ -17,6 +17,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.output import atomic_file, atomic_folder
+from edslam_ti.ray_casting import RayCaster, rays_from
 from edslam_ti.simulation.renderer import Renderer
 from edslam_ti.simulation.scene import Scene
 
@@ -79,9 +80,7 @@ def novel_poses(
     The directions are spread over the image plane. Where an object is in the way the next direction is
     tried; where all are blocked there is no view.
     """
-    o3d = load_open3d()
-    rays = o3d.t.geometry.RaycastingScene()
-    rays.add_triangles(o3d.core.Tensor(scene.vertices), o3d.core.Tensor(scene.triangles))
+    caster = RayCaster(scene.vertices, scene.triangles)
     count = int(np.clip(round(duration / INTERVAL), *COUNTS))
     result = []
     for k in range(count):
@@ -90,9 +89,7 @@ def novel_poses(
         offset = OFFSETS[k % len(OFFSETS)]
         angles = 2 * np.pi * ((3 * k + np.arange(DIRECTIONS)) % DIRECTIONS) / DIRECTIONS
         directions = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)  # [8, 3] camera
-        origins = np.broadcast_to(T[:3, 3], directions.shape)
-        probes = np.concatenate([origins, directions @ T[:3, :3].T], -1).astype(np.float32)
-        free = np.flatnonzero(rays.cast_rays(o3d.core.Tensor(probes))["t_hit"].numpy() > offset + CLEARANCE)
+        free = np.flatnonzero(caster.cast(rays_from(T, directions)).distance > offset + CLEARANCE)
         if len(free) == 0:
             continue
         direction = directions[free[0]]

@@ -21,8 +21,9 @@ import numpy as np
 from edslam_ti.alignment import MIN_PIXELS
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
+from edslam_ti.event_images.change import BrightnessChange
 from edslam_ti.event_images.contrast import ContrastThreshold
-from edslam_ti.event_images.solve import BrightnessChange
+from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.patch_warp import NormalEquations
@@ -82,6 +83,7 @@ class BrightnessTracker:
         self._aligner = KeyframeAligner(camera, config, seed)
         self._surface_tracker = BidirectionalPatchTracker(camera, surface_config, config, seed)
         self._change = BrightnessChange(camera.shape, *contrast.by_polarity)
+        self.noisy_pixels = NoisyPixels(camera.shape)
         self._segment_start = 0  # first frame of the segment of uninterrupted events
         self._recent: list[BrightnessFrame] = []  # last frames of the segment
         self._state: Starting | Coasting | Tracking = Starting()
@@ -94,12 +96,14 @@ class BrightnessTracker:
         """Return the pose of `frame` and corrections of earlier poses."""
         path = PathDraft(trajectory)
         note = ""
+        self.noisy_pixels.add(frame.event_counts)
         if len(trajectory) > 0:
-            self._rate.add(len(frame.events))
+            self._rate.add(self.noisy_pixels.num_other_events(frame.event_counts))
             if self._rate.is_silent:
                 note = self._without_events(path, guess)
-        self._change.add(frame.events)
-        newest = self._aligner.brightness_frame(len(trajectory), frame, self._change.log_brightness())
+        self._change.add(frame.event_counts)
+        change = self.noisy_pixels.replaced(self._change.log_brightness())
+        newest = self._aligner.brightness_frame(len(trajectory), frame, change)
         self._recent = [*self._recent, newest][-self._settings.window :]
         state = self._state
         if isinstance(state, Tracking):

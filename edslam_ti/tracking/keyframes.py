@@ -12,10 +12,11 @@ import numpy as np
 from torch import Tensor
 
 from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, linearised, residual_model
-from edslam_ti.camera import Camera
+from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.config import TrackingConfig
+from edslam_ti.depth_images import downscaled, downscaled_depth
 from edslam_ti.event_images.solve import Observation, compile_kernels, solve_log_brightness_image
-from edslam_ti.frame import Frame, downscaled, downscaled_depth
+from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse, orthonormalized, se3_exp
 from edslam_ti.kernels import depth_average
 from edslam_ti.kernels.depth_average import DepthAgreement, PixelRays, average_depth
@@ -261,10 +262,9 @@ class KeyframeAligner:
 
     def _warped(self, depth: np.ndarray, T_b_a: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return where every fourth pixel of a depth image is seen from b: x, y, and u, v in a."""
-        fx, fy, cx, cy = self.camera.intrinsics
         v, u = 2 * np.stack(np.nonzero(depth[::2, ::2]))
-        z = depth[v, u]
-        x, y, z = T_b_a[:3, :3] @ np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z]) + T_b_a[:3, 3:]
-        front = z > 0.05
-        x, y, z, u, v = (a[front] for a in (x, y, z, u, v))
-        return fx * x / z + cx, fy * y / z + cy, u, v
+        points = self.camera.back_project_pixels(u, v, depth[v, u])
+        points = (T_b_a[:3, :3] @ points.T + T_b_a[:3, 3:]).T
+        front = points[:, 2] > NEAREST
+        x, y, _ = self.camera.project(points[front], NEAREST)
+        return x, y, u[front], v[front]

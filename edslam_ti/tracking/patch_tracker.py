@@ -57,9 +57,10 @@ class _Problem:
             if self.is_bidirectional:
                 poses.append(T_reference_camera)
                 unknowns.append(adjoint(T_reference_camera))
-        first, *rest = (
-            system.transformed(unknown) for system, unknown in zip(self.alignment.linearise(poses), unknowns)
-        )
+        systems = self.alignment.linearise(poses)
+        if self.alignment.is_compositional:  # their unknown: exp(xi) T = T exp(Ad(T^-1) xi)
+            systems = [s.transformed(np.linalg.inv(adjoint(T))) for s, T in zip(systems, poses)]
+        first, *rest = (system.transformed(unknown) for system, unknown in zip(systems, unknowns))
         return sum(rest, start=first)
 
 

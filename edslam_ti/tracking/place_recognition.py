@@ -28,8 +28,7 @@ def pose_by_features(
     known = z > 0
     if known.sum() < MIN_MATCHES:
         return None
-    fx, fy, cx, cy = camera.intrinsics
-    points = np.stack([(at_old[:, 0] - cx) / fx * z, (at_old[:, 1] - cy) / fy * z, z], -1)
+    points = camera.back_project_pixels(at_old[:, 0], at_old[:, 1], z)
     cv2.setRNGSeed(0)
     is_solved, rotation, translation, inliers = cv2.solvePnPRansac(
         points[known], at_new[known], camera.matrix, None, reprojectionError=2.0

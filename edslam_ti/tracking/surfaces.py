@@ -8,7 +8,9 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig
-from edslam_ti.frame import Frame, downscaled, downscaled_depth
+from edslam_ti.depth_images import downscaled, downscaled_depth
+from edslam_ti.event_images.noisy import NoisyPixels
+from edslam_ti.frame import Frame
 from edslam_ti.kernels.time_surface import time_surface, update_last_timestamps
 
 
@@ -49,12 +51,15 @@ class SurfaceFrameBuilder:
     def __init__(self, camera: Camera, config: TimeSurfaceConfig) -> None:
         self._config = config
         self._last_timestamps = np.full(camera.shape, -np.inf)
+        self.noisy_pixels = NoisyPixels(camera.shape)
 
     def build(self, frame: Frame) -> SurfaceFrame:
         """Take in the frame's events, and return it with its smoothed surface."""
         events = frame.events
         update_last_timestamps(events.x, events.y, events.t, self._last_timestamps)
+        self.noisy_pixels.add(frame.event_counts)
         surface = time_surface(self._last_timestamps, frame.timestamp, self._config.decay)
+        surface = self.noisy_pixels.replaced(surface)
         if self._config.blur > 0:
             surface = cv2.GaussianBlur(surface, (0, 0), self._config.blur)
         return SurfaceFrame(frame, surface)

@@ -195,6 +195,7 @@ def test_real_kinect_motion_is_followed(shared_data: Path) -> None:
         depth = cv2.imread(str(folder / f"frame-{k:06d}.depth.png"), -1)[2::4, 2::4].astype(np.float32) / 1000
         depth[depth > 10] = 0  # 65.535 m marks missing depth
         colour = cv2.imread(str(folder / f"frame-{k:06d}.color.jpg"), 0)
+        assert colour is not None
         grey = cv2.resize(colour, (160, 120), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         truth.append(np.loadtxt(folder / f"frame-{k:06d}.pose.txt"))
         now = frame(times[k], depth, grey)

@@ -152,10 +152,19 @@ def test_polarity_zero_means_negative_where_the_file_says_so_throughout(tmp_path
     np.save(tmp_path / "e.npy", events)
     polarity = EventFile(tmp_path / "e.npy", WIDTH, HEIGHT).between(0, 1).polarity
     assert (polarity == np.where(events[:, 3] > 0, 1, -1)).all()
-    events[1500, 3] = -1
+    events[1500:1600, 3] = -1
     np.save(tmp_path / "e.npy", events)
-    with pytest.raises(DataError, match="row 1500: expected polarity"):
-        EventFile(tmp_path / "e.npy", WIDTH, HEIGHT).between(0, 1)
+    with pytest.raises(DataError, match=r"row 15\d\d: expected polarity"):
+        EventFile(tmp_path / "e.npy", WIDTH, HEIGHT)
+
+
+def test_a_bad_row_is_left_out_of_a_sequence_and_counted(tmp_path: Path) -> None:
+    events = some_events()
+    events[1700, 1] = 33014
+    folder = write_sequence(tmp_path / "s", events)
+    read_all(folder)
+    sequence = EventReplicaSequence(folder)
+    assert (len(sequence.events(-1, 1)), sequence.num_dropped_events) == (2999, 1)
 
 
 def test_large_absolute_stamps_are_shifted_together(tmp_path: Path) -> None:
@@ -204,9 +213,11 @@ def test_reading_slices_does_not_keep_the_file_in_memory(tmp_path: Path) -> None
 
 
 def _set(row: int, column: int, value: float) -> Any:
+    """Put a value into every fourth row from one on: too many to be left out."""
+
     def change(folder: Path) -> None:
         events = some_events()
-        events[row, column] = value
+        events[row::4, column] = value
         save_events(folder, events)
 
     return change

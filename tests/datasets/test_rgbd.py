@@ -171,7 +171,8 @@ def test_a_recording_without_events_is_tracked(tiny_sequence: EventDepthSequence
         millimetres = np.rint(1000 * tiny_sequence.depth(k)).astype(np.uint16)
         assert cv2.imwrite(str(folder / f"results/depth{k:06d}.png"), millimetres)
         assert cv2.imwrite(str(folder / f"results/frame{k:06d}.png"), np.rint(255 * image).astype(np.uint8))
-    np.savetxt(folder / "traj.txt", [np.ravel(tiny_sequence.true_pose(float(t))) for t in stamps])
+    assert tiny_sequence.truth is not None
+    np.savetxt(folder / "traj.txt", [tiny_sequence.truth.at(float(t)).ravel() for t in stamps])
     values = dict(zip(("w", "h", "fx", "fy", "cx", "cy"), [camera.width, camera.height, *camera.intrinsics]))
     (folder / "cam_params.json").write_text(json.dumps({"camera": values | {"scale": 1000}}))
     (folder / "camera.json").write_text('{"frame_rate": 20}')

@@ -2,13 +2,12 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from edslam_ti.datasets.rpg import RpgSequence, open_text_events
+from edslam_ti.datasets.rpg import RpgSequence
 from edslam_ti.errors import DataError
 
 WIDTH, HEIGHT = 40, 30
@@ -63,10 +62,10 @@ def test_an_image_of_events_is_undistorted_as_an_image(folder: Path) -> None:
     raw = np.zeros((HEIGHT, WIDTH), np.float32)
     np.add.at(raw, (rows[:, 2].astype(int), rows[:, 1].astype(int)), 1)
     K = sequence.camera.matrix
-    maps = cv2.initUndistortRectifyMap(
+    columns, lines = cv2.initUndistortRectifyMap(
         K, np.array([-0.2, 0.05, 0, 0, 0]), np.eye(3), K, (WIDTH, HEIGHT), cv2.CV_32FC1
     )
-    expected = cv2.remap(raw, *(np.rint(m) for m in maps), cv2.INTER_NEAREST)
+    expected = cv2.remap(raw, np.rint(columns), np.rint(lines), cv2.INTER_NEAREST)
     events = sequence.events(0, 1)
     count = np.zeros((HEIGHT, WIDTH), np.float32)
     np.add.at(count, (events.y, events.x), 1)
@@ -76,27 +75,12 @@ def test_an_image_of_events_is_undistorted_as_an_image(folder: Path) -> None:
     assert set(events.t) <= set(rows[:, 0])
 
 
-def test_text_is_parsed_once_and_again_when_it_changes(folder: Path, cache: Path) -> None:
-    open_text_events(folder / "events.txt", WIDTH, HEIGHT)
-    [binary] = cache.glob("events/*.npy")
-    written = binary.stat().st_mtime_ns
-    assert len(open_text_events(folder / "events.txt", WIDTH, HEIGHT)) == 500
-    assert [p.stat().st_mtime_ns for p in cache.glob("events/*")] == [written]
-    with (folder / "events.txt").open("a") as file:
-        file.write("0.2 1 1 1\n")
-    assert len(open_text_events(folder / "events.txt", WIDTH, HEIGHT)) == 501
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("events.txt", "", r"events\.txt: the file is empty"),
-        ("events.txt", "\n\n", r"events\.txt: expected lines 't x y p', got an empty file"),
-        ("events.txt", "0.1 1 1\n", r"events\.txt: expected 4 numbers a line"),
-        ("events.txt", "0.1 1 1 1\n0.2 1 one 1\n", r"events\.txt: expected lines .* behind row 0: .*one"),
-        ("events.txt", "0.1 1 1 1\n0.2 1", r"events\.txt: expected lines .* from 4 to 2 at row 2"),
-        ("events.txt", "t x y p\n0.1 1 1 1\n", r"events\.txt: expected lines .* behind row 0: .*'t'"),
-        ("events.txt", "0.1 1 1 1\n0.2 40 1 1\n", r"events\.txt: row 2: expected x in 0 to 39"),
+        ("events.txt", "0.1 1 1\n", r"events\.txt: line 1: expected 4 numbers 't x y p', got '0\.1 1 1'"),
+        ("events.txt", "0.1 1 1 1\n0.2 40 1 1\n", r"events\.txt: line 2: expected x in 0 to 39"),
         ("calib.txt", "1 2 3\n", r"calib\.txt: expected 9 numbers a line .* got 3"),
         ("calib.txt", "no calibration\n", r"calib\.txt: expected 9 numbers"),
         ("calib.txt", "0 30 19 14 0 0 0 0 0\n", r"camera: expected finite fx, fy"),
@@ -116,16 +100,7 @@ def test_bad_data_is_refused_in_one_line(
     with pytest.raises((DataError, FileNotFoundError), match=message) as caught:
         RpgSequence(folder)
     assert "\n" not in str(caught.value)
-    assert not [p for p in cache.glob("events/*") if ".partial" in p.name]
-
-
-def test_a_long_text_is_announced_in_the_log_alone(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capfd: Any
-) -> None:
-    monkeypatch.setattr("edslam_ti.datasets.rpg.SLOW_TO_PARSE", 100)
-    open_text_events(folder / "events.txt", WIDTH, HEIGHT)
-    assert f"reading {folder / 'events.txt'} once" in caplog.text
-    assert "reading" not in capfd.readouterr().out
+    assert not list(cache.glob("events/.*"))
 
 
 def test_depth_poses_and_camera_of_slider_depth_agree(shared_data: Path, tmp_path: Path) -> None:

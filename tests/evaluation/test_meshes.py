@@ -7,7 +7,8 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation.meshes import SPACING, TrueSurfaces, read_triangles, seen_pixels, seen_points
+from edslam_ti.evaluation.meshes import SPACING, TrueSurfaces, seen_pixels, seen_points
+from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.open3d_loader import load_open3d
 
 CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
@@ -32,12 +33,12 @@ def surfaces(tmp_path_factory) -> TrueSurfaces:
 
 
 def test_seen_points_lie_on_the_surface_inside_the_view(surfaces: TrueSurfaces) -> None:
-    seen = seen_points(surfaces.looks(CAMERA, [np.eye(4)]))
+    seen = seen_points(surfaces.views(CAMERA, [np.eye(4)]))
     assert seen[:, 2] == pytest.approx(2.0)
     assert np.abs(seen[:, 0]).max() == pytest.approx(2.0 * 31 / 40, abs=0.06)
     moved = np.eye(4)
     moved[0, 3] = 0.5
-    both = seen_points(surfaces.looks(CAMERA, [np.eye(4), moved, moved]))
+    both = seen_points(surfaces.views(CAMERA, [np.eye(4), moved, moved]))
     cells = np.floor(both / SPACING).astype(int)
     assert len(np.unique(cells, axis=0)) == len(both)  # what is seen twice counts once
     assert both[:, 0].max() == pytest.approx(seen[:, 0].max() + 0.5, abs=1e-5)
@@ -52,7 +53,7 @@ def test_pixels_are_seen_where_another_camera_looked_and_nothing_was_in_the_way(
     beside[0, 3] = 0.5
     depth = surfaces.depth(CAMERA, beside)
     assert set(np.round(np.unique(depth), 4)) == {1.0, 2.0}
-    seen = seen_pixels(CAMERA, depth, beside, surfaces.looks(CAMERA, [np.eye(4)]))
+    seen = seen_pixels(CAMERA, depth, beside, surfaces.views(CAMERA, [np.eye(4)]))
     x = 0.5 + depth * CAMERA.rays()[..., 0]  # metres, of what each pixel shows
     on_wall = depth > 1.5
     border = 2.0 * CAMERA.cx / CAMERA.fx  # 1.575 m: what the camera at 0 sees of the wall,
@@ -64,7 +65,7 @@ def test_pixels_are_seen_where_another_camera_looked_and_nothing_was_in_the_way(
 
 
 def test_mesh_in_front_of_the_surface_is_as_far_in_both_directions(surfaces: TrueSurfaces) -> None:
-    seen = seen_points(surfaces.looks(CAMERA, [np.eye(4)]))
+    seen = seen_points(surfaces.views(CAMERA, [np.eye(4)]))
     errors = surfaces.errors(wall(1.97), seen, np.eye(4))
     assert errors.accuracy_cm == pytest.approx(3.0, abs=1e-3)
     assert errors.completion_cm == pytest.approx(3.0, abs=1e-3)
@@ -76,7 +77,7 @@ def test_mesh_in_front_of_the_surface_is_as_far_in_both_directions(surfaces: Tru
 
 
 def test_half_a_mesh_is_accurate_and_half_complete(surfaces: TrueSurfaces) -> None:
-    seen = seen_points(surfaces.looks(CAMERA, [np.eye(4)]))
+    seen = seen_points(surfaces.views(CAMERA, [np.eye(4)]))
     errors = surfaces.errors(wall(2.0, right=0.0), seen, np.eye(4))
     assert errors.accuracy_cm < 1e-3
     # The right half is 0 to 1.55 m away, 5 cm of it near enough.
@@ -89,7 +90,7 @@ def test_a_mesh_without_triangles_is_refused(surfaces: TrueSurfaces, tmp_path: P
     with pytest.raises(DataError, match="got 0 triangles"):
         surfaces.errors(empty, np.zeros((1, 3), np.float32), np.eye(4))
     with pytest.raises(FileNotFoundError, match="mesh not found"):
-        read_triangles(tmp_path / "none.ply")
+        read_triangle_mesh(tmp_path / "none.ply")
     (tmp_path / "bad.ply").write_text("no mesh")
     with pytest.raises(DataError, match="could not read any triangle"):
-        read_triangles(tmp_path / "bad.ply")
+        read_triangle_mesh(tmp_path / "bad.ply")

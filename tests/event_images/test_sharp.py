@@ -30,7 +30,9 @@ def frames_of(sequence: EventDepthSequence) -> list[Frame]:
 
 def test_brightness_over_its_mean_during_the_exposure() -> None:
     # Two pixels: one doubles after a quarter of the exposure, then halves behind it; the other stays.
-    events = Events(np.int16([0, 0]), np.int16([0, 0]), np.array([1.0, 5.0]), np.int8([1, -1]))
+    events = Events(
+        np.zeros(2, np.int16), np.zeros(2, np.int16), np.array([1.0, 5.0]), np.array([1, -1], np.int8)
+    )
     step = np.log([2.0, 0.5])
     mean = 0.25 * 1 + 0.75 * 2
     for time, brightness in ((0.5, 1), (3.0, 2), (6.0, 1)):
@@ -39,7 +41,7 @@ def test_brightness_over_its_mean_during_the_exposure() -> None:
 
 
 def test_without_exposure_the_image_is_brought_to_the_time_of_the_frame() -> None:
-    events = Events(np.int16([0]), np.int16([0]), np.array([1.0]), np.int8([1]))
+    events = Events(np.zeros(1, np.int16), np.zeros(1, np.int16), np.array([1.0]), np.ones(1, np.int8))
     for taken, time, expected in ((0.5, 1.5, 0.1), (1.5, 0.5, -0.1), (0.2, 0.5, 0.0)):
         part = events.between(min(taken, time), max(taken, time))
         change = change_from_mean(part, np.full(len(part), 0.1), (taken, taken), time, (1, 1))
@@ -66,7 +68,7 @@ def test_events_of_the_exposure_take_out_its_motion_blur(tmp_path: Path) -> None
     assert sharpened < 0.5 * as_they_are  # 0.018 and 0.057 were measured
 
 
-def test_clipped_pixels_only_bound_brightness(tiny_sequence: EventDepthSequence) -> None:
+def test_clipped_pixels_only_bound_brightness(tiny_sequence: EventDepthSequence, tiny_folder: Path) -> None:
     grey = np.full(tiny_sequence.camera.shape, 0.5, np.float32)
     grey[3, 5], grey[4, 6] = 0.0, 1.0
 
@@ -74,8 +76,7 @@ def test_clipped_pixels_only_bound_brightness(tiny_sequence: EventDepthSequence)
         def image(self, index: int) -> np.ndarray:
             return grey
 
-    assert isinstance(tiny_sequence, EventReplicaSequence)
-    sequence = Clipped(tiny_sequence._folder)
+    sequence = Clipped(tiny_folder)
     image = SharpImages(sequence, THRESHOLD, MappingConfig()).at(frames_of(sequence)[3])
     assert image is not None
     for other in (-6.0, 0.5):  # darker than black, brighter than white
@@ -104,20 +105,17 @@ class Rare(EventReplicaSequence):
         return super().image(4 * index + 1)
 
 
-def test_between_images_events_carry_on(
-    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
-) -> None:
-    assert isinstance(tiny_sequence, EventReplicaSequence)
-    rare, config = Rare(tiny_sequence._folder), MappingConfig(max_views=10)
+def test_between_images_events_carry_on(tiny_folder: Path, tiny_samples: list[Sample]) -> None:
+    rare, config = Rare(tiny_folder), MappingConfig(max_views=10)
     images = EventImages(rare.camera, THRESHOLD, config, SharpImages(rare, THRESHOLD, config))
     trajectory = Trajectory()
     for k, frame in enumerate(frames_of(rare)):
-        images.append(frame, k)
+        images.add(frame, k)
         T = tiny_samples[k].T_world_camera
         assert T is not None
         trajectory.append(frame.timestamp, T)
     assert images.solve(trajectory, is_thorough=True)
-    images.thin_out(keep=set())
+    images.drop_surplus(keep=set())
     assert len(images.frames) == 10
     errors = []
     for k in images.frames:
@@ -160,10 +158,9 @@ def mapped(
 
 
 def test_images_fix_the_level_and_those_of_held_out_frames_stay_unused(
-    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+    tiny_sequence: EventDepthSequence, tiny_folder: Path, tiny_samples: list[Sample]
 ) -> None:
-    assert isinstance(tiny_sequence, EventReplicaSequence)
-    watched = Watched(tiny_sequence._folder)
+    watched = Watched(tiny_folder)
     _, raw, corrected = mapped(tiny_sequence, tiny_samples[:10], frames=False)
     _, raw_with, corrected_with = mapped(watched, tiny_samples[:10], frames=True)
     assert raw_with > raw + 3  # 18.1 and 30.8 dB were measured

@@ -1,5 +1,6 @@
 """Benchmark: alternatives compute what the kernels compute; the app leaves its table."""
 
+import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -7,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from patches import normal_equations
 
 import edslam_ti.experiments.steps
 from apps.benchmark import main
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import EdSlamError
+from edslam_ti.experiments.front_end import front_end
 from edslam_ti.experiments.kernel_times import (
+    OURS,
     Row,
     Stopwatch,
     cold_start,
@@ -24,16 +28,19 @@ from edslam_ti.experiments.kernel_times import (
     tracking_inputs,
 )
 from edslam_ti.experiments.steps import Curve, mapping_step, slam
-from edslam_ti.kernels.patch_warp import ResidualModel, normal_equations
+from edslam_ti.kernels.engine import ENGINE, ENGINES, VERSION
+from edslam_ti.kernels.patch_warp import ResidualModel
 from edslam_ti.kernels.projection import MIN_ALPHA
 from edslam_ti.kernels.rasterization import rasterize
 from edslam_ti.kernels.reference import project
 from edslam_ti.mapping.gaussians import GaussianMap
 
+OTHER = next((e for e in ENGINES if e != ENGINE and importlib.util.find_spec(e)), None)
+
 
 def test_pair_list_renders_and_differentiates_like_the_kernel() -> None:
-    inputs, intrinsics = room_scene(300, 40, 30)
-    inputs = [x.requires_grad_() for x in inputs]
+    scene, intrinsics = room_scene(300, 40, 30)
+    inputs = [x.requires_grad_() for x in scene]
     view = rasterize(*inputs, intrinsics, (40, 30))
     ours, theirs = (view.image, view.depth, view.alpha), rasterize_pairs(*inputs, intrinsics, (40, 30))
     for a, b in zip(ours, theirs):
@@ -111,7 +118,7 @@ def test_app_writes_a_table_and_numbers(tmp_path: Path, capsys: pytest.CaptureFi
     assert table == capsys.readouterr().out
     rows = read(tmp_path)["rows"]
     assert {row["suite"] for row in rows} == {"rasterizer", "time_surface", "tracking", "mapping_step"}
-    assert {row["name"] for row in rows} >= {"Taichi", "torch pair list", "torch twin", "numpy"}
+    assert {row["name"] for row in rows} >= {OURS, "torch pair list", "torch twin", "numpy"}
     assert all(row["wall_ms"] > 0 for row in rows)
     assert all(row["limit_ms"] > 0 for row in rows if row["suite"] == "rasterizer")
 
@@ -141,12 +148,46 @@ def test_frames_of_a_sequence_pass_through_every_method(
 
 def test_cold_start_is_the_sum_of_its_parts() -> None:
     total, *parts = cold_start(threads=2, rounds=1)
-    assert [row.name for row in parts] == ["import", "start Taichi", "compile every kernel"]
+    assert [row.name for row in parts] == ["import", f"start {OURS}", "compile every kernel"]
     assert total.cpu_ms == pytest.approx(sum(row.cpu_ms for row in parts))
     assert all(row.cpu_ms > 1 for row in parts)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(OTHER is None, reason="quadrants is not installed")
+def test_another_engine_has_a_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert OTHER is not None
+    size = ("--sizes", "32", "24", "--events", "100", "--rounds", "1", "--suites", "time_surface", "tracking")
+    main([*size, "--engines", ENGINE, OTHER, "--out", str(tmp_path)])
+    machine, _, header, _, *lines = capsys.readouterr().out.splitlines()
+    assert f"by {ENGINE} {VERSION}" in machine
+    assert header.endswith(f"| limit ms | {OTHER} wall ms |")
+    ours = [line for line in lines if f"| {OURS}" in line]
+    assert len(ours) == 5
+    assert all(float(line.split("|")[-2]) > 0 for line in ours)
+    assert all(line.endswith("|  |") for line in lines if line not in ours)
+    assert {row["suite"] for row in read(tmp_path)["other_engines"][OTHER]} == {"time_surface", "tracking"}
+
+
+def test_the_engine_of_a_running_process_stays() -> None:
+    other = "taichi" if ENGINE == "quadrants" else "quadrants"
+    with pytest.raises(EdSlamError, match=f"this process already runs {ENGINE}"):
+        main(["--engines", other])
 
 
 def test_missing_device_is_one_line() -> None:
     if not torch.cuda.is_available():
         with pytest.raises(EdSlamError, match="use --device cpu"):
             main(["--device", "cuda"])
+
+
+def test_the_front_end_is_timed_in_a_cache_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr("edslam_ti.experiments.front_end.IN_MEMORY", 10_000)
+    monkeypatch.setattr("edslam_ti.datasets.event_file.IN_MEMORY", 10_000)
+    rows = list(front_end((64, 48), 5_000, Stopwatch(1)))
+    assert [row.task.split(": ")[1] for row in rows] == ["check and copy", "read, count, time surface"]
+    assert all(row.wall_ms > 0 for row in rows)
+    assert not list(tmp_path.iterdir())

@@ -15,7 +15,7 @@ from sequences import TINY, tiny_room
 from apps import reproduce
 from edslam_ti.camera import Camera
 from edslam_ti.command_line import UsageError
-from edslam_ti.config import Config, MappingConfig
+from edslam_ti.config import Config, MappingConfig, dataset_differences
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.datasets.altered import AlteredSequence, RepeatedSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
@@ -27,11 +27,12 @@ from edslam_ti.experiments.ablations import (
     ablation_rows,
     ablation_variants,
 )
-from edslam_ti.experiments.cases import Case, Recording, Selection, all_cases, quick_cases
-from edslam_ti.experiments.long_stream import FrameCost, held_bytes, measure, stretches, table
+from edslam_ti.experiments.cases import Case, Recording, all_cases, quick_cases
+from edslam_ti.experiments.long_stream import FrameCost, held_bytes, measure, table, windows
 from edslam_ti.experiments.recordings import Recordings
 from edslam_ti.experiments.report import insert_into, markdown, write_report
 from edslam_ti.experiments.runs import Variant, methods_as_variants, result_file, run_all
+from edslam_ti.experiments.selection import Selection
 from edslam_ti.mapping.gaussians import GaussianMap
 from edslam_ti.methods import METHODS
 from edslam_ti.simulation import HandHeldPath, make_path, simulate
@@ -115,7 +116,7 @@ def test_growth_is_counted_from_the_warm_up_on() -> None:
         FrameCost(t, 0.2 if t < 15 else 0.3, 0.1, 0.1, 500 + t, int(1000 * t), 0.2 * t, 7.0, 0.1 * t)
         for t in range(20)
     ]
-    text = table(stretches(costs, length=5.0))
+    text = table(windows(costs, length=5.0))
     parts = "map +2.0, frames +0.0, tracker +1.0, other +7.0"
     assert f"Since 10 s: +10 MB with +10000 Gaussians ({parts}), CPU time a frame +50 %." in text
 
@@ -188,7 +189,7 @@ def test_bench_records_failures_continues_and_is_resumed(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "event_replica.yaml").write_text("tracking: {levels: 2}")
-    monkeypatch.setattr(runs, "CONFIGS", tmp_path)
+    monkeypatch.setattr(runs, "dataset_differences", lambda dataset: dataset_differences(dataset, tmp_path))
     cases = [tiny_case(s) for s in ("absent", "tiny", "broken")] + [
         tiny_case("tiny", depth="kinect", rate=10)
     ]
@@ -333,7 +334,7 @@ def test_app_says_what_it_expects(tmp_path: Path) -> None:
         ([], "expected a command first: tracking, ablations"),
         (["track"], "expected a command first"),
         (["tracking", "--scenes", "nowhere"], "no case passes the filters"),
-        (["tracking", "--sceens", "wall"], "Unrecognized"),
+        (["tracking", "--sceens", "wall"], "unknown option '--sceens'; did you mean '--scenes'"),
     ):
         with pytest.raises(UsageError, match=message):
             reproduce.main(arguments)

@@ -1,16 +1,15 @@
-"""The keyframe's brightness image: the kernels against sparse matrices, and a scene that is known."""
+"""The keyframe's brightness image: the kernels against their twins, and a scene that is known."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy import sparse
-from scipy.sparse.linalg import spsolve
 
 from edslam_ti import kernels
 from edslam_ti.camera import Camera
 from edslam_ti.event_images.solve import HUBER, Observation, solve_log_brightness_image
-from edslam_ti.geometry import exp_matrix
+from edslam_ti.geometry import se3_exp
+from edslam_ti.kernels import reference
 from edslam_ti.kernels.brightness_image import ChangeImage, Pair, solve_brightness_image
 
 CAMERA = Camera(41, 30, 36.0, 36.0, 20.0, 14.5)  # 41 x 30 pixels are no multiple of the lanes
@@ -31,56 +30,16 @@ def observations(count: int = 5) -> list[Observation]:
     twists = RANDOM.normal(0, 0.04, (count, 6))
     changes = RANDOM.normal(0, 0.3, (count, *CAMERA.shape)).astype(np.float32)
     return [
-        Observation(exp_matrix(twist), change, None if k % 2 else scene())
+        Observation(se3_exp(twist), change, None if k % 2 else scene())
         for k, (twist, change) in enumerate(zip(twists, changes))
     ]
 
 
-def equations(
-    first: ChangeImage, second: ChangeImage, T: np.ndarray, is_strict: bool = False
-) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Return the rows l(u) - l(x(u)) = E_second(x(u)) - E_first(u) of every pixel seen twice, one by one."""
-    assert first.depth is not None
-    height, width = first.depth.shape
-    rows, changes = [], []
-    for v, u in np.argwhere(first.depth > 0):
-        ray = np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1])
-        p = T[:3, :3] @ (first.depth[v, u] * ray) + T[:3, 3]
-        x, y = CAMERA.fx * p[0] / p[2] + CAMERA.cx, CAMERA.fy * p[1] / p[2] + CAMERA.cy
-        if not (p[2] > 0.05 and 0 <= x < width - 1.001 and 0 <= y < height - 1.001):
-            continue
-        i, j = int(y), int(x)
-        corners = (slice(i, i + 2), slice(j, j + 2))
-        if second.depth is not None:
-            measured = second.depth[corners]
-            if p[2] > np.where(measured > 0, measured, np.inf).min() * 1.03 + 0.02:
-                continue  # hidden
-            if is_strict and (np.abs(measured - p[2]) >= 0.03 * p[2]).any():
-                continue  # another surface, or none
-        weights = np.outer([1 - (y - i), y - i], [1 - (x - j), x - j])
-        row = np.zeros((height, width))
-        if not first.is_known:
-            row[v, u] = 1
-        if not second.is_known:
-            row[corners] -= weights
-        rows.append(sparse.csr_matrix(row.ravel()))
-        changes.append((weights * second.change[corners]).sum() - first.change[v, u])
-    return sparse.vstack(rows), np.array(changes)
-
-
 def minimum(
-    systems: list[tuple[sparse.csr_matrix, np.ndarray]], prior: np.ndarray, is_robust: Sequence[bool]
+    systems: list[tuple[np.ndarray, np.ndarray]], prior: np.ndarray, is_robust: Sequence[bool]
 ) -> np.ndarray:
-    """Return what conjugate gradients approach: sparse normal equations, solved directly."""
-    A, b = sparse.vstack([a for a, _ in systems]), np.concatenate([c for _, c in systems])
-    level = prior
-    for robust in is_robust:
-        weight = np.minimum(1, HUBER / np.abs(A @ level.ravel() - b)) if robust else np.ones(len(b))
-        normal = A.T @ sparse.diags(weight) @ A + PRIOR_WEIGHT * sparse.eye(prior.size)
-        level = spsolve(normal.tocsc(), A.T @ (weight * b) + PRIOR_WEIGHT * prior.ravel()).reshape(
-            prior.shape
-        )
-    return level
+    A, b = (np.concatenate(parts) for parts in zip(*systems, strict=True))
+    return reference.brightness_image(A, b, prior, PRIOR_WEIGHT, HUBER, is_robust)
 
 
 def solved(prior: np.ndarray, seen: list[Observation], iterations: int, is_robust: bool) -> np.ndarray:
@@ -88,11 +47,16 @@ def solved(prior: np.ndarray, seen: list[Observation], iterations: int, is_robus
 
 
 @pytest.mark.parametrize("is_robust", [False, True])
-def test_image_is_that_of_sparse_matrices(is_robust: bool) -> None:
+def test_image_is_that_of_the_twin(is_robust: bool) -> None:
     prior = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32)
     seen = observations()
     own = ChangeImage(np.zeros(CAMERA.shape, np.float32), scene())
-    systems = [equations(own, ChangeImage(o.change, o.depth), o.T_camera_keyframe) for o in seen]
+    systems = [
+        reference.brightness_equations(
+            own, ChangeImage(o.change, o.depth), o.T_camera_keyframe, CAMERA.intrinsics
+        )
+        for o in seen
+    ]
     expected = minimum(systems, prior, [is_robust])
     assert np.abs(expected - prior).max() > 0.3
     np.testing.assert_allclose(solved(prior, seen, 200, is_robust), expected, atol=1e-3)  # single precision
@@ -107,10 +71,14 @@ def test_equations_of_any_two_images_with_known_ones_among_them() -> None:
     depths = [measured, measured, None, measured]
     images = [ChangeImage(change, depth, k == 1) for k, (change, depth) in enumerate(zip(changes, depths))]
     chosen = [(0, 1), (1, 0), (0, 2), (2, 0), (3, 1), (0, 3)]
-    pairs = [Pair(*two, exp_matrix(RANDOM.normal(0, 0.04, 6))) for two in chosen]
+    pairs = [Pair(*two, se3_exp(RANDOM.normal(0, 0.04, 6))) for two in chosen]
     robust = (False, True)
     systems = [
-        equations(images[p.first], images[p.second], p.T_second_first, True) for p in pairs if p.first != 2
+        reference.brightness_equations(
+            images[p.first], images[p.second], p.T_second_first, CAMERA.intrinsics, is_strict=True
+        )
+        for p in pairs
+        if p.first != 2  # it has no depth
     ]
     expected = minimum(systems, prior, robust)
     level, is_observed = solve_brightness_image(
@@ -123,11 +91,11 @@ def test_equations_of_any_two_images_with_known_ones_among_them() -> None:
     np.testing.assert_array_equal(level[~is_observed], prior[~is_observed])
 
 
-def test_image_is_the_same_for_any_number_of_threads() -> None:
+def test_image_is_the_same_for_any_number_of_threads(device: str) -> None:
     prior, seen = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32), observations()
     images = []
     for threads in (1, 2, 2):  # 2 is what the other tests run with
-        kernels.init(threads=threads)
+        kernels.init(device, threads=threads)
         images.append(solved(prior, seen, 12, True))
         solved(-prior, observations(), 12, True)  # leaves nothing behind
     assert np.array_equal(images[0], images[1])

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 import torch
 
+from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.lanes import (
     LANES,
     SUMS,

@@ -130,7 +130,7 @@ def test_size_of_tiles_does_not_matter(tile: int, pixelwise: bool) -> None:
         assert float((a - b).norm()) <= 1e-5 * float(b.norm())
 
 
-def test_number_of_threads_does_not_change_the_result() -> None:
+def test_number_of_threads_does_not_change_the_result(device: str) -> None:
     inputs = [x.requires_grad_() for x in make_scene(300, seed=6)]
 
     def image_and_gradients() -> list[torch.Tensor]:
@@ -138,9 +138,9 @@ def test_number_of_threads_does_not_change_the_result() -> None:
         return [view.image, *torch.autograd.grad(view.image.sin().sum() + view.depth.sum(), inputs)]
 
     two = image_and_gradients()
-    kernels.init("cpu", threads=1)
+    kernels.init(device, threads=1)
     one = image_and_gradients()
-    kernels.init("cpu", threads=2)
+    kernels.init(device, threads=2)
     assert all(torch.equal(a, b) for a, b in zip(one, two))
 
 

@@ -122,12 +122,12 @@ def test_surfaces_by_polarity_need_polarities() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_any_number_of_threads_keeps_the_newest_event(threads: int) -> None:
+def test_any_number_of_threads_keeps_the_newest_event(device: str, threads: int) -> None:
     x, y, t, _ = make_events(MANY_EVENTS + 2, 6)
     last = np.full(SHAPE, -np.inf)
-    kernels.init("cpu", threads=threads)
+    kernels.init(device, threads=threads)
     update_last_timestamps(x, y, t, last)
-    kernels.init("cpu", threads=2)
+    kernels.init(device, threads=2)
     expected = reference.last_timestamps(*(torch.from_numpy(a) for a in (x, y, t)), SHAPE)
     assert np.array_equal(last, expected.numpy())
 

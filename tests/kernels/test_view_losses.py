@@ -1,5 +1,7 @@
 """Fused comparisons of views: value and all gradients are those of rendering and torch."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -43,10 +45,6 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     return 0.3 * torch.randn(shape, generator=generator) - 1, depth
 
 
-def intensity(view: reference.Rasterization) -> torch.Tensor:
-    return view.image[..., 0] + (1 - view.alpha) * BACKGROUND
-
-
 def assert_same(ours: list[torch.Tensor], theirs: list[torch.Tensor], tolerance: float) -> None:
     names = ("loss", "means", "quats", "scales", "opacities", "colors", "poses")
     for name, a, b in zip(names, ours, theirs, strict=True):
@@ -57,17 +55,24 @@ def with_gradients(loss: torch.Tensor, inputs: list[torch.Tensor]) -> list[torch
     return [loss.detach(), *torch.autograd.grad(loss, inputs)]
 
 
-def change_twin(render, inputs: list[torch.Tensor], measured: torch.Tensor, scale: float) -> torch.Tensor:
+Renderer = Callable[..., reference.Rasterization]
+
+
+def change_twin(
+    render: Renderer, inputs: list[torch.Tensor], measured: torch.Tensor, scale: float
+) -> torch.Tensor:
     *gaussians, poses = inputs
-    start, end = (intensity(render(*gaussians, pose, INTRINSICS, SIZE)) + EPSILON for pose in poses)
-    return scale * (torch.log(end / start) - measured).square().sum()
+    start, end = (render(*gaussians, pose, INTRINSICS, SIZE) for pose in poses)
+    return scale * reference.compare_change(start, end, measured, BACKGROUND, EPSILON)
 
 
-def view_twin(render, inputs: list[torch.Tensor], target: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+def view_twin(
+    render: Renderer, inputs: list[torch.Tensor], target: torch.Tensor, depth: torch.Tensor
+) -> torch.Tensor:
     *gaussians, poses = inputs
     view = render(*gaussians, poses[0], INTRINSICS, SIZE)
-    error = (view.depth - view.alpha * depth).abs()[depth > 0].sum()
-    return 0.7 * (torch.log(intensity(view) + EPSILON) - target).square().sum() + 0.2 * error
+    squares, errors = reference.compare_view(view, target, depth, BACKGROUND, EPSILON)
+    return 0.7 * squares + 0.2 * errors
 
 
 def change(inputs: list[torch.Tensor], measured: torch.Tensor, scale: float, **options: int) -> torch.Tensor:
@@ -111,7 +116,7 @@ def test_both_match_the_torch_twin_in_double_precision() -> None:
     assert_same(with_gradients(view.loss, inputs), theirs, 1e-9)
 
 
-def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter() -> None:
+def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter(device: str) -> None:
     inputs, (measured, _) = [*make_map(300), make_poses()], images()
 
     def run(**options: int) -> list[torch.Tensor]:
@@ -120,11 +125,11 @@ def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter() -> No
     first = run()
     assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
     assert_same(run(tile=8), first, 1e-5)
-    kernels.init("cpu", threads=1)
+    kernels.init(device, threads=1)
     try:
         assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
     finally:
-        kernels.init("cpu", threads=2)
+        kernels.init(device, threads=2)
 
 
 def test_a_view_of_nothing_has_zero_gradients() -> None:

@@ -108,12 +108,12 @@ def test_a_part_is_optimised_as_the_whole_would_be_and_the_rest_stays() -> None:
     before = {name: value.detach().clone() for name, value in whole.raw.items()}
     chosen = torch.arange(0, 60, 2)
     for _ in range(3):
-        part = whole.part(chosen)
+        part = whole.subset(chosen)
         for optimised, indices in ((part, torch.arange(30)), (same, chosen)):
             shown = optimised.activated()
             (shown.colors[indices].square().sum() + shown.scales[indices].prod(-1).sum()).backward()
             optimised.step()
-        whole.take_over(part, chosen)
+        whole.update_from(part, chosen)
     torch.testing.assert_close(whole.activated().colors, same.activated().colors)
     for name, value in whole.raw.items():
         torch.testing.assert_close(value[chosen], same.raw[name][chosen], msg=name)
@@ -124,7 +124,7 @@ def test_gaussians_at_assumed_depth_can_be_left_out() -> None:
     gaussians = GaussianMap(CONFIG)
     add(gaussians, 3)
     assert gaussians.measured() is gaussians
-    tables = [torch.full((2, 3), 7.0), upright(2), torch.full((2, 3), 0.1)]
+    tables = torch.full((2, 3), 7.0), upright(2), torch.full((2, 3), 0.1)
     gaussians.add(*tables, 0.5, torch.full((2, 1), 0.5), 1, torch.tensor([False, True]))
     gaussians.keep(torch.tensor([True, False, True, True, True]))
     gaussians.clone(torch.tensor([2]))  # the assumed one
@@ -147,7 +147,7 @@ def test_gaussians_follow_the_frame_they_are_from() -> None:
         )
     quarter = se3_exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))  # about z
     quarter[2, 3] = 0.5
-    gaussians.follow({8: quarter, 99: quarter})
+    gaussians.move_with_frames({8: quarter, 99: quarter})
     expected = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.5]])
     torch.testing.assert_close(gaussians.raw["means"].detach(), expected)
     half = 0.5**0.5

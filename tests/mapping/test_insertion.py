@@ -1,11 +1,11 @@
-"""Depth to points, and their spacing."""
+"""Where Gaussians are added (Eq. 13), at what spacing, as what discs."""
 
 import numpy as np
 import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.mapping.insertion import beside_steps, depth_to_points, surface_discs, with_holes_filled
+from edslam_ti.mapping.insertion import densify_mask, depth_to_points, spaced, surface_discs
 
 CAMERA = Camera(width=8, height=6, fx=7.0, fy=9.0, cx=3.25, cy=2.5)
 
@@ -71,8 +71,8 @@ def test_discs_lie_on_a_tilted_plane_and_look_round_from_the_camera() -> None:
     depth = (-2.0 / (camera.rays() @ normal)).astype(np.float32)  # the plane 2 m away along its normal
     T = pose()
     pixels = np.array([[31, 23], [10, 40], [50, 5]])
-    quats, stretch = surface_discs(depth, camera, T, pixels, max_stretch=10.0)
-    for (x, y), (qw, qx, qy, qz), longer in zip(pixels, quats.astype(np.float64), stretch):
+    quats, elongation = surface_discs(depth, camera, T, pixels, max_elongation=10.0)
+    for (x, y), (qw, qx, qy, qz), longer in zip(pixels, quats.astype(np.float64), elongation):
         v, w = np.array([qx, qy, qz]), qw
         axes = np.stack([e + 2 * np.cross(v, np.cross(v, e) + w * e) for e in np.eye(3)], -1)
         np.testing.assert_allclose(np.abs(axes[:, 2] @ T[:3, :3] @ normal), 1.0, atol=1e-4)
@@ -88,31 +88,32 @@ def test_disc_beside_missing_depth_or_an_edge_faces_the_camera() -> None:
     depth[:, 10:] = 3.0
     depth[5, 5] = 0
     pixels = np.array([[9, 4], [4, 5], [0, 0]])
-    _, stretch = surface_discs(depth, camera, np.eye(4), pixels, max_stretch=4.0)
-    np.testing.assert_allclose(stretch, 1.0)
-    _, stretch = surface_discs(depth, camera, np.eye(4), np.array([[2, 2]]), max_stretch=4.0)
-    assert stretch[0] > 1  # seen from the side
+    _, elongation = surface_discs(depth, camera, np.eye(4), pixels, max_elongation=4.0)
+    np.testing.assert_allclose(elongation, 1.0)
+    _, elongation = surface_discs(depth, camera, np.eye(4), np.array([[2, 2]]), max_elongation=4.0)
+    assert elongation[0] > 1  # seen from the side
 
 
-def test_steps_are_found_on_both_sides_and_not_on_a_slanted_plane() -> None:
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-    plane = (-2.0 / (camera.rays() @ np.array([0.8, 0.0, -0.6]))).astype(np.float32)  # 1.7 to 10 m away
-    assert not beside_steps(plane).any()
-    step = np.full(camera.shape, 2.0, np.float32)
-    step[20:, 30:] = 2.1
-    expected = np.zeros(camera.shape, bool)
-    expected[20:, 29:31] = expected[19:21, 30:] = True
-    assert (beside_steps(step) == expected).all()
+def test_densify_mask_is_the_truth_table_of_eq_13() -> None:
+    depth = np.array([[2.0, 2.0, 2.0, 0.0, 2.0, 2.0]])
+    alpha = np.array([[0.9, 0.7, 0.9, 0.1, 0.9, 0.9]])
+    rendered = np.array([[2.01, 2.0, 3.0, 0.0, 2.01, 2.01]])
+    mask = densify_mask(alpha, rendered, depth, min_visibility=0.8, depth_error_factor=50.0)
+    # well seen | transparent | 100 times the median error | nothing measured | well seen ...
+    assert mask.tolist() == [[False, True, True, False, False, False]]
 
 
-def test_large_holes_lie_behind_what_surrounds_them_and_narrow_ones_stay() -> None:
-    depth = np.full((60, 80), 2.0, np.float32)
-    depth[:, 40:] = 3.0
-    depth[10:40, 30:60] = 0  # a window
-    depth[50, :] = 0  # a line that the sensor missed
-    filled = with_holes_filled(depth)
-    assert filled[10:40, 30:60] == pytest.approx(1.25 * 3.0)
-    assert (filled[50] == 0).all()
-    measured = depth > 0
-    assert (filled[measured] == depth[measured]).all()
-    assert (with_holes_filled(np.zeros_like(depth)) == 0).all()  # nothing to go by
+def test_empty_map_needs_gaussians_wherever_there_is_depth() -> None:
+    depth = np.array([[1.0, 0.0], [2.0, 3.0]])
+    nothing = np.zeros_like(depth)
+    assert (densify_mask(nothing, nothing, depth, 0.8, 50.0) == (depth > 0)).all()
+    assert not densify_mask(nothing, nothing, nothing, 0.8, 50.0).any()
+
+
+def test_one_pixel_is_taken_of_every_block_as_wide_as_the_spacing() -> None:
+    spacing = np.full((6, 9), 3)
+    spacing[:, 3:] = 1
+    expected = np.ones((6, 9), bool)
+    expected[:, :3] = False
+    expected[[1, 4], 1] = True
+    assert (spaced(spacing) == expected).all()

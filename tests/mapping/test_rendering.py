@@ -1,13 +1,12 @@
-"""Views of a map: background, depth, and images at half size."""
+"""Views of a map: background and depth."""
 
 import numpy as np
 import torch
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import MappingConfig
-from edslam_ti.kernels.projection import LOW_PASS
 from edslam_ti.mapping.gaussians import GaussianMap
-from edslam_ti.mapping.rendering import drawable, reduced_low_pass, render, render_view
+from edslam_ti.mapping.rendering import drawable, render, render_view
 
 CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
 
@@ -57,7 +56,7 @@ def test_gaussians_that_cannot_be_drawn_change_no_pixel() -> None:
     pose = torch.eye(4)
     pose[0, 3], pose[2, 3] = 1.2, 1.0
     chosen = drawable(gaussians, CAMERA, pose)
-    whole, part = (render(g.activated(), CAMERA, pose, 0.5) for g in (gaussians, gaussians.part(chosen)))
+    whole, part = (render(g.activated(), CAMERA, pose, 0.5) for g in (gaussians, gaussians.subset(chosen)))
     assert torch.equal(part.intensity, whole.intensity)
     assert torch.equal(part.depth, whole.depth)
     assert torch.equal(part.visible, whole.visible[chosen])
@@ -75,9 +74,10 @@ def test_camera_that_steps_back_sees_the_wall_farther_away() -> None:
 def test_median_depth_is_that_of_a_surface_even_at_an_outline() -> None:
     both = wall(2.0)
     both.raw["means"].data[:, 0] -= 2.0  # its outline in the middle of the view
-    behind = wall(3.0)
-    both.add(*(getattr(behind.activated(), name).detach() for name in ("means", "quats", "scales")), 0.95,
-             behind.activated().colors.detach())  # fmt: skip
+    behind = wall(3.0).activated()
+    both.add(
+        behind.means.detach(), behind.quats.detach(), behind.scales.detach(), 0.95, behind.colors.detach()
+    )
     T = np.eye(4)
     depth = render_view(both, CAMERA, T, background=0.5).depth
     expected = render(both.activated(), CAMERA, torch.from_numpy(T), 0.5).expected_depth
@@ -91,27 +91,10 @@ def test_median_depth_is_that_of_a_surface_even_at_an_outline() -> None:
     assert depth[24, 48] == 3.0
 
 
-def test_half_size_image_is_the_mean_of_blocks() -> None:
-    gaussians = wall(2.0, spacing=0.2).activated()  # 4 pixels apart
-    with torch.no_grad():
-        full = render(gaussians, CAMERA, torch.eye(4), background=0.5).intensity
-        half = render(gaussians, CAMERA, torch.eye(4), background=0.5, reduction=2).intensity
-    blocks = full.unflatten(0, (24, 2)).unflatten(2, (32, 2)).mean((1, 3))
-    error = (half - blocks).square().mean().sqrt()
-    # A Gaussian filter is not a box: 4 % was measured, and 10 % with the full-size filter.
-    assert float(error) < 0.05 * float(blocks.std())
-
-
-def test_low_pass_of_the_full_size_is_the_renderers_own() -> None:
-    assert reduced_low_pass(1) == LOW_PASS
-    # A block of two pixels has variance 1/4 full-size px^2: 1/16 half-size px^2, the filter a quarter.
-    np.testing.assert_allclose(reduced_low_pass(2), LOW_PASS / 4 + 1 / 16)
-
-
 def test_gradients_reach_the_map_and_the_pose() -> None:
     gaussians = wall(2.0, spacing=0.2)
     pose = torch.eye(4, dtype=torch.float64, requires_grad=True)
-    view = render(gaussians.activated(), CAMERA, pose, background=0.5, reduction=2)
+    view = render(gaussians.activated(), CAMERA, pose, background=0.5)
     (view.intensity.square().mean() + view.depth.mean()).backward()
     assert pose.grad is not None
     assert float(pose.grad[:3].abs().min(0).values.max()) > 0

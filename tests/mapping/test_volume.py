@@ -8,7 +8,7 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.mapping.volume import MeshView, TsdfVolume, without_depth_edges
+from edslam_ti.mapping.volume import MeshView, TsdfVolume
 
 CAMERA = Camera(width=160, height=120, fx=130.0, fy=130.0, cx=75.0, cy=63.0)
 NORMAL = np.array([0.3, 0.2, -1.0])
@@ -117,16 +117,3 @@ def test_view_with_hardly_any_depth_is_passed_over() -> None:
     volume.integrate(depth, depth, np.eye(4))
     assert volume.num_frames == 0
     assert len(volume.mesh().triangles) == 0
-
-
-def test_both_sides_of_a_depth_step_are_left_out() -> None:
-    depth = np.full((6, 8), 2.0, np.float32)
-    depth[:, 4:] = 1.5
-    depth[2, 1] = 0
-    kept = without_depth_edges(depth)
-    expected = depth.copy()
-    expected[:, 3:5] = 0
-    assert np.array_equal(kept[[0, 5]], expected[[0, 5]])
-    assert np.array_equal(kept[:, 5:], depth[:, 5:])
-    slanted = np.tile(np.linspace(1.0, 1.3, 8, dtype=np.float32), (6, 1))  # 4 % a pixel
-    assert np.array_equal(without_depth_edges(slanted), slanted)

@@ -1,6 +1,5 @@
 """Pictures are made without a display, and what they show is what was measured."""
 
-import json
 import runpy
 import subprocess
 import sys
@@ -9,37 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from saved_results import curve, write_result
 from scipy.spatial.transform import Rotation
 
-from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.open3d_loader import load_open3d
-from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
-from edslam_ti.results.plots import (
-    StubViewer,
-    Viewer,
-    align_to_truth,
-    draw_results,
-    fill_cloud,
-    fill_lines,
-    frustum_lines,
-    load_result,
-    path_lines,
-    plot_trajectory,
-    show_results,
-)
+from edslam_ti.results.plots import align_to_truth, draw_results, plot_trajectory
+from edslam_ti.results.window import show_results
 from edslam_ti.trajectory import Trajectory, write_tum
 
-CAMERA = Camera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
 VIEW_APP = Path(__file__).parents[2] / "apps" / "view.py"
-
-
-def curve(count: int = 40) -> Trajectory:
-    times = np.linspace(0, 2, count)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, 3] = np.stack([np.sin(times), 0.1 * times, 0.3 * np.cos(2 * times)], -1)
-    poses[:, :3, :3] = Rotation.from_rotvec(times[:, None] * [0, 0.2, 0]).as_matrix()
-    return Trajectory(times, poses)
 
 
 def moved(trajectory: Trajectory, noise: float = 0.0) -> Trajectory:
@@ -59,18 +36,7 @@ def is_picture(path: Path, min_size: int = 200) -> bool:
 
 @pytest.fixture(scope="module")
 def result_folder(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("result")
-    write_tum(curve(), folder / "trajectory_tum.txt")
-    (folder / "metrics.json").write_text(
-        json.dumps({"scene": "office0", "method": "ed_slam", "ate_rmse_cm": 0.42})
-    )
-    y, x = np.mgrid[0:60, 0:80]
-    brightness = 0.5 + 0.4 * np.sin(x / 5) * np.cos(y / 7)
-    view = (np.full(CAMERA.shape, 1.5, np.float32), brightness, curve().pose(0))
-    write_mesh(folder / "mesh.ply", fuse_mesh([view], CAMERA, voxel_size=0.03))
-    points = np.random.default_rng(0).normal(size=(500, 3)) * 0.3 + [0, 0, 1.5]
-    write_points(folder / "points.ply", points, np.linspace(0, 1, 500))
-    return folder
+    return write_result(tmp_path_factory.mktemp("result"))
 
 
 def test_alignment_undoes_a_rigid_motion() -> None:
@@ -154,63 +120,18 @@ def test_run_without_mesh_is_drawn_by_its_points(result_folder: Path, tmp_path: 
     assert is_picture(tmp_path / "run.png", min_size=600)
 
 
-def test_result_has_a_title_with_its_error(result_folder: Path) -> None:
-    result = load_result(result_folder)
-    assert result.title == "office0 ed_slam: ATE 0.42 cm rmse"
-    assert result.mesh is not None
-    assert result.points is not None
-    assert len(result.points) == 500
-
-
-def test_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="not a results folder"):
-        load_result(tmp_path)
-    with pytest.raises(FileNotFoundError, match="results folder not found"):
-        load_result(tmp_path / "absent")
+def test_nothing_to_draw_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="at least one"):
         draw_results([], tmp_path / "runs.png")
 
 
-@pytest.mark.parametrize("name", ["points.ply", "mesh.ply", "metrics.json"])
-def test_broken_parts_of_a_result_are_named(result_folder: Path, tmp_path: Path, name: str) -> None:
-    write_tum(curve(), tmp_path / "trajectory_tum.txt")
-    (tmp_path / name).write_bytes(b"garbage")
-    with pytest.raises(DataError, match=name):
-        load_result(tmp_path)
-
-
-def test_window_without_display_is_a_clear_error(result_folder: Path, monkeypatch) -> None:
+def test_window_of_results_without_display_is_a_clear_error(result_folder: Path, monkeypatch) -> None:
     if not sys.platform.startswith("linux"):
         pytest.skip("displays are announced by the environment on Linux only")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(EdSlamError, match="no display"):
-        Viewer()
-    with pytest.raises(EdSlamError, match="no display"):
         show_results([result_folder])
-    StubViewer().update(curve(), None, CAMERA)
-    StubViewer().close()
-
-
-def test_frustum_opens_from_the_camera_along_its_view() -> None:
-    T = curve().pose(20)
-    lines = np.array(frustum_lines(T, CAMERA, size=0.1))  # [8, 2, 3]
-    in_camera = (lines - T[:3, 3]) @ T[:3, :3]
-    np.testing.assert_allclose(in_camera[4:, 0], 0, atol=1e-12)  # four edges leave the centre,
-    np.testing.assert_allclose(in_camera[:4, :, 2], 0.1)  # four lie in the image plane
-    # The corners are those of the outer pixels: half a pixel beyond the first and last centres.
-    assert np.ptp(in_camera[:4, :, 0]) == pytest.approx(0.1 * CAMERA.width / CAMERA.fx)
-
-
-def test_window_geometry_holds_paths_and_points() -> None:
-    o3d = load_open3d()
-    lines, cloud = o3d.geometry.LineSet(), o3d.geometry.PointCloud()
-    fill_lines(o3d, lines, path_lines(curve().poses[:, :3, 3]), "#0072B2")
-    assert len(lines.lines) == 39
-    fill_lines(o3d, lines, path_lines(curve(10).poses[:, :3, 3]), "#0072B2")  # refilled, not appended
-    assert len(lines.lines) == len(lines.colors) == 9
-    fill_cloud(o3d, cloud, np.zeros((3, 3)), np.array([-1.0, 0.5, 2.0]))
-    np.testing.assert_allclose(np.asarray(cloud.colors)[:, 0], [0, 0.5, 1])
 
 
 def test_view_app_saves_a_picture(result_folder: Path, tmp_path: Path, capsys) -> None:

@@ -18,7 +18,6 @@ from sequences import (
 
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
-from edslam_ti.event_images.solve import HYSTERESIS, BrightnessChange
 from edslam_ti.events import Events
 from edslam_ti.slam import Slam
 
@@ -45,17 +44,6 @@ def messages(slam: Slam) -> str:
 
 def lost(slam: Slam) -> list[int]:
     return [k for k, result in enumerate(slam.results) if not result.converged]
-
-
-def test_change_is_the_sum_of_thresholds_and_half_a_one_towards_the_last() -> None:
-    change = BrightnessChange((2, 3), 0.2, 0.3)
-    x, y = np.array([0, 0, 2, 0], np.int16), np.array([0, 0, 1, 0], np.int16)
-    change.add(Events(x, y, np.arange(4.0), np.array([1, 1, -1, -1], np.int8)))
-    expected = np.zeros((2, 3))
-    expected[0, 0], expected[1, 2] = 0.2 * 2 - 0.3 * (1 + HYSTERESIS), -0.3 * (1 + HYSTERESIS)
-    np.testing.assert_allclose(change.log_brightness(), expected, atol=1e-6)
-    change.reset()
-    assert (change.log_brightness() == 0).all()
 
 
 def test_brightness_images_are_better_than_time_surfaces_between_depth_images(
@@ -165,6 +153,28 @@ def test_a_slow_camera_that_stops_keeps_its_image(
     assert ("events are missing" in messages(slam)) == is_fast
     moved = slam.trajectory.poses[12:, :3, 3] - slam.trajectory.pose(11)[:3, 3]
     assert np.linalg.norm(moved, axis=1).max() < 0.002
+
+
+def with_noisy_pixels(sample: Sample, pixels: np.ndarray, rate: float) -> Sample:  # [P, 2] x, y; Hz
+    """Return a sample in which some pixels fire by themselves, always with one polarity."""
+    t = np.arange(sample.timestamp - 0.05, sample.timestamp, 1 / rate)
+    x, y = np.tile(pixels.astype(np.int16), (len(t), 1)).T
+    noise = Events(x.copy(), y.copy(), np.repeat(t, len(pixels)), np.ones(len(x), np.int8))
+    events = Events.concatenate([sample.events, noise])
+    return replace(sample, events=events[np.argsort(events.t, kind="stable")])
+
+
+@pytest.mark.parametrize("is_brightness", [True, False])
+def test_pixels_that_fire_by_themselves_are_masked(
+    sequence: EventDepthSequence, samples: list[Sample], is_brightness: bool
+) -> None:
+    config = settings(tracking={"brightness": is_brightness})
+    size = sequence.camera.width, sequence.camera.height
+    pixels = np.random.default_rng(0).integers(0, size, (20, 2))
+    noisy = [with_noisy_pixels(sample, pixels, 5_000) for sample in samples]
+    clean, masked = (tracked(sequence, s, config) for s in (samples, noisy))
+    assert lost(masked) == []
+    assert ate_cm(masked, sequence) < 1.2 * ate_cm(clean, sequence) + 0.01
 
 
 def test_same_seed_gives_the_same_bits(sequence: EventDepthSequence, samples: list[Sample]) -> None:

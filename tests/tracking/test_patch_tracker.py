@@ -151,7 +151,7 @@ def test_only_the_combined_objective_has_depth_residuals(
     tiny_samples: list[Sample],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    counts = []
+    counts: list[int] = []
     linearise = Alignment.linearise
 
     def counting(self: Alignment, poses: list[np.ndarray]) -> list[NormalEquations]:

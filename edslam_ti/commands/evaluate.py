@@ -1,0 +1,63 @@
+"""edslam evaluate EST.txt TRUTH.txt [--mesh MESH.ply --recording DIR]
+
+Print the absolute and relative pose errors of a trajectory, both files in TUM format (t tx ty tz qx qy qz qw,
+seconds and metres): the numbers of evo_ape and evo_rpe. The truth is interpolated at the estimate's times.
+With --mesh and --recording also the accuracy and completion of a mesh against the true surfaces that the
+camera of a simulated recording (`edslam simulate`) saw at the estimate's times.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from edslam_ti.arguments import Shown, UsageError, read_options
+from edslam_ti.config import Stage
+
+
+class EvaluateOptions(Stage):
+    """What to compare."""
+
+    estimate: Annotated[Path, Shown("EST.txt", is_positional=True)]
+    """Estimated trajectory, TUM format."""
+    truth: Annotated[Path, Shown("TRUTH.txt", is_positional=True)]
+    """True trajectory, TUM format."""
+    mesh: Path | None = None
+    """Mesh made with the estimated trajectory, in its frame."""
+    recording: Path | None = None
+    """Folder of the simulated recording it was made from."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Compare two trajectories, and a mesh with the true surfaces."""
+    options = read_options(EvaluateOptions, argv, "edslam evaluate", __doc__)
+    if (options.mesh is None) != (options.recording is None):
+        raise UsageError("--mesh and --recording: expected both or neither; give the missing one")
+    from edslam_ti.evaluation.trajectories import statistics, trajectory_errors
+    from edslam_ti.trajectory import read_tum
+
+    estimate = read_tum(options.estimate)
+    errors = trajectory_errors(estimate, read_tum(options.truth))
+    print(f"{errors.num_poses} poses compared over {errors.timestamps[-1] - errors.timestamps[0]:.3f} s")
+    tables = {
+        "APE w.r.t. translation part (m)\n(with SE(3) Umeyama alignment)": errors.errors_cm / 100,
+        "APE w.r.t. translation part (m)\n(with Sim(3) Umeyama alignment)": errors.errors_sim3_cm / 100,
+        "RPE w.r.t. translation part (m)\nfor delta = 1 (frames)": errors.motion_errors_cm / 100,
+        "RPE w.r.t. rotation angle in degrees (deg)\nfor delta = 1 (frames)": errors.motion_errors_deg,
+    }
+    for title, values in tables.items():
+        print(f"\n{title}\n")
+        for name, value in statistics(values).items():
+            print(f"{name:>10}\t{value:.6f}")
+    print(f"\nSim(3) scale {errors.scale:.6f}; ATE rmse {errors.ate_rmse_cm:.3f} cm")
+    if options.mesh is not None and options.recording is not None:
+        from edslam_ti.datasets.event_replica import EventReplicaSequence
+        from edslam_ti.evaluation.meshes import mesh_errors
+        from edslam_ti.mesh_reading import read_triangle_mesh
+
+        surface = mesh_errors(
+            read_triangle_mesh(options.mesh), EventReplicaSequence(options.recording), estimate
+        )
+        print(
+            f"mesh accuracy {surface.accuracy_cm:.3f} cm, completion {surface.completion_cm:.3f} cm, "
+            f"{100 * surface.completion_ratio:.2f} % within 5 cm"
+        )

@@ -1,0 +1,205 @@
+"""Compact copies of checked events in the user's cache: four raw arrays in a folder, 13 bytes an event.
+
+    x.bin, y.bin     int16     pixel
+    t.bin            float64   seconds as the file states them, ascending
+    polarity.bin     int8      -1 or +1
+    events.json      number of events, and what was left out
+
+Seconds stay float64: whole microseconds would take as much and change the stamps of simulated recordings,
+which are in nanoseconds or float32.
+
+A copy is known by the path, size and time of change of its source. It is written under a temporary name,
+which holds the process's number, so that what a killed process leaves is never taken for finished and is
+removed by the next one.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import uuid
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from edslam_ti.errors import DataError
+from edslam_ti.events import Events
+
+VERSION = 1  # raise it when the checks change, so that old copies are made again
+DTYPES = {n: np.dtype(d) for n, d in (("x", "<i2"), ("y", "<i2"), ("t", "<f8"), ("polarity", "i1"))}
+BYTES_PER_EVENT = sum(dtype.itemsize for dtype in DTYPES.values())
+DESCRIPTION = "events.json"
+CHECKED_AT_ONCE = 100_000  # events; what is made of them stays in a core's cache
+SPARE_ROOM = 100_000_000  # bytes that a copy leaves free
+
+
+@dataclass(frozen=True)
+class CopySummary:
+    """What is known of checked events besides themselves."""
+
+    num_events: int
+    num_rows: int  # of the source
+    num_dropped: int
+    notes: tuple[str, ...] = ()  # sentences for the user
+
+
+class EventsInMemory:
+    """Sorted events that have been checked."""
+
+    def __init__(self, events: Events) -> None:
+        self._events = events
+
+    def between(self, start: float, end: float) -> Events:
+        """Return the events with start <= t < end (views)."""
+        return self._events.between(start, end)
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        return float(self._events.t[0]), float(self._events.t[-1])
+
+
+class MappedEvents:
+    """The sorted events of a copy. Slices are mapped: what they show is read when it is looked at."""
+
+    def __init__(self, folder: Path, size: tuple[int, int]) -> None:
+        self._folder = folder
+        self._size = size
+        # Files stay open: a copy that is removed or replaced meanwhile can still be read.
+        self._files = {name: (folder / f"{name}.bin").open("rb") for name in DTYPES}
+
+    def between(self, start: float, end: float) -> Events:
+        """Return the events with start <= t < end, read-only.
+
+        The copy is mapped afresh for each slice, so that the pages it touched leave the process with it.
+        """
+        events = self._all().between(start, end)
+        for piece in events.pieces(CHECKED_AT_ONCE):
+            self._check(piece)
+        return events
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        t = self._all().t
+        return float(t[0]), float(t[-1])
+
+    def _all(self) -> Events:
+        return Events(**{name: _mapped(self._files[name], dtype) for name, dtype in DTYPES.items()})
+
+    def _check(self, events: Events) -> None:
+        """Refuse numbers that a damaged disk has put there: kernels would write outside their images."""
+        width, height = self._size
+        # As unsigned numbers negative ones are large; -1 and 1 are 0 and 2 when one is added.
+        is_inside = events.x.view(np.uint16).max() < width and events.y.view(np.uint16).max() < height
+        sign = (events.polarity + np.int8(1)).view(np.uint8)
+        is_sign = sign.max() <= 2 and not (sign & 1).any()
+        if not (is_inside and is_sign and (events.t[1:] >= events.t[:-1]).all()):
+            raise DataError(f"{self._folder}: damaged; remove it, and it is made again")
+
+
+def _mapped(file: BinaryIO, dtype: np.dtype) -> np.ndarray:
+    return np.memmap(file, dtype, mode="r").view(np.ndarray)
+
+
+class EventCopy:
+    """The compact copy of one source in a folder of copies."""
+
+    def __init__(self, parent: Path, source: Path, size: tuple[int, int], settings: str) -> None:
+        """`settings` is whatever else the copy depends on."""
+        self._parent = parent
+        self._source = source
+        status = source.stat()
+        path = _digest(str(source.resolve()))
+        state = _digest(f"{VERSION}|{status.st_size}|{status.st_mtime_ns}|{size}|{settings}")
+        self._prefix = f"{_plain(source.parent.name)}_{path}_"
+        self.folder = parent / f"{self._prefix}{state}"
+
+    def read(self) -> CopySummary | None:
+        """Return what the copy says of itself, None where there is none or it is damaged."""
+        try:
+            values = json.loads((self.folder / DESCRIPTION).read_text(encoding="utf-8"))
+            summary = CopySummary(**values | {"notes": tuple(values["notes"])})
+            for name, dtype in DTYPES.items():
+                if (self.folder / f"{name}.bin").stat().st_size != summary.num_events * dtype.itemsize:
+                    return None
+        except (OSError, ValueError, TypeError, KeyError, RecursionError):
+            return None
+        return summary if summary.num_events > 0 else None
+
+    def has_room(self, most_events: int) -> bool:
+        """Return whether the disk has room for that many events."""
+        self._parent.mkdir(parents=True, exist_ok=True)
+        return shutil.disk_usage(self._parent).free > most_events * BYTES_PER_EVENT + SPARE_ROOM
+
+    def write(self, parts: Iterable[Events], summary: Callable[[int], CopySummary]) -> CopySummary:
+        """Write the copy; it stands under its name when it is complete. Raises `OSError`.
+
+        `summary` is called with the number of events when all have been written.
+        """
+        self._parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self._parent)
+        partial = self._parent / f".{uuid.uuid4().hex[:8]}.{_host()}.{os.getpid()}.partial"
+        partial.mkdir()
+        try:
+            number = 0
+            with contextlib.ExitStack() as stack:
+                files = {n: stack.enter_context((partial / f"{n}.bin").open("wb")) for n in DTYPES}
+                for part in parts:
+                    for name, dtype in DTYPES.items():
+                        files[name].write(np.ascontiguousarray(getattr(part, name), dtype).data)
+                    number += len(part)
+                for file in files.values():  # a power cut must not leave a complete name over zeros
+                    file.flush()
+                    os.fsync(file.fileno())
+            result = summary(number)
+            (partial / DESCRIPTION).write_text(json.dumps(asdict(result)), encoding="utf-8")
+            self._replace(partial)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        return result
+
+    def _replace(self, partial: Path) -> None:
+        """Give a finished copy its name; remove damaged and outdated copies of the same source."""
+        for old in self._parent.glob(f"{self._prefix}*"):
+            if old != self.folder or self.read() is None:
+                shutil.rmtree(old, ignore_errors=True)
+        try:
+            partial.rename(self.folder)
+        except OSError:
+            if self.read() is None:  # else another process was faster
+                raise
+
+
+def remove_leftovers(parent: Path) -> None:
+    """Remove partial copies of processes of this machine that no longer run."""
+    for path in parent.glob(".*.partial"):
+        match = re.fullmatch(r"\.[0-9a-f]{8}\.(.+)\.(\d+)\.partial", path.name)
+        if match and match[1] == _host() and not _runs(int(match[2])):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _host() -> str:
+    return _digest(platform.node())
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:12]
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9-]", "-", name)[:40]

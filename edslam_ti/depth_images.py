@@ -1,0 +1,159 @@
+"""Depth images: reduced, with holes filled, and where one surface ends and another begins.
+
+Depth is in metres, 0 = missing. Whether pixels belong to the same surface is asked for five purposes. They
+differ in what is compared and in which mistake costs more, hence in their limits, all shares of the depth:
+
+    halving for the tracker       range of 2 x 2 depths          HALVED_RANGE
+    reducing for brightness       range of a block's depths      REDUCED_RANGE
+    denser Gaussians at outlines  second difference              OUTLINE_STEP
+    normals of new Gaussians      second difference              SMOOTH_STEP
+    fusing rendered depth         difference of two neighbours   FUSED_STEP
+
+Kernels ask the same of warped points, with constants of their own (`SAME_SURFACE` and `OCCLUSION` in
+`kernels/brightness_image.py`, `MAX_SLOPE` in `kernels/patch_warp.py`, `DepthAgreement` in
+`kernels/depth_average.py`, the setting `max_depth_difference` in metres): there noise and errors of the
+pose come in, too.
+"""
+
+import cv2
+import numpy as np
+
+from edslam_ti.kernels.brightness_image import SAME_SURFACE
+
+# Of 2 x 2 pixels: steeper slopes have no use in tracking, and a mean over an edge is a surface nowhere.
+HALVED_RANGE = 0.05
+# Of a block: the solver accepts SAME_SURFACE to either side of its mean.
+REDUCED_RANGE = 2 * SAME_SURFACE
+# From there on neighbours are two surfaces. No slant reaches it, since a plane has hardly any second
+# difference. A false alarm costs a few Gaussians, a miss a ragged outline.
+OUTLINE_STEP = 0.03
+# Up to there the neighbours on both sides give a normal. Stricter: a wrong normal tilts a disc out of the
+# surface, whereas none leaves it facing the camera.
+SMOOTH_STEP = 0.02
+# From there on a pixel of a rendered view may lie between two surfaces. Slants of up to 5 % a pixel stay.
+FUSED_STEP = 0.05
+
+HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
+FAR_SIDE = 90  # percentile of the depth around a hole
+BEHIND = 1.25  # times that is assumed in it: what is too near would hide surfaces measured later
+
+
+def downscaled(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
+    """Return the means of 2x2 blocks; odd edges are cut off."""
+    a, b, c, d = _corners(image)
+    mean: np.ndarray = image.dtype.type(0.25) * (a + b + c + d)
+    return mean
+
+
+def downscaled_depth(depth: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
+    """Return means of 2x2 blocks where all four depths exist and lie on one surface, else 0 (missing)."""
+    a, b, c, d = _corners(depth)
+    low = np.minimum(np.minimum(a, b), np.minimum(c, d))
+    high = np.maximum(np.maximum(a, b), np.maximum(c, d))
+    return np.where(_is_one_surface(low, high, HALVED_RANGE), 0.25 * (a + b + c + d), np.float32(0))
+
+
+def block_means(image: np.ndarray, reduction: int) -> np.ndarray:  # [H, W] -> [H / r, W / r] float32
+    """Return the means of blocks of reduction x reduction pixels, odd edges cut off.
+
+    `reduction` 1 returns the image itself. Of 2, means may differ from `downscaled` in the last bit.
+    """
+    return image if reduction == 1 else _blocks(image, reduction).mean((1, 3), dtype=np.float32)
+
+
+def block_depth(depth: np.ndarray, reduction: int) -> np.ndarray:  # [H, W] -> [H / r, W / r]
+    """Return block means where all depths of a block exist and lie on one surface, else 0 (missing)."""
+    if reduction == 1:
+        return depth
+    blocks = _blocks(depth, reduction)
+    low, high = blocks.min((1, 3)), blocks.max((1, 3))
+    return np.where(_is_one_surface(low, high, REDUCED_RANGE), blocks.mean((1, 3)), 0)
+
+
+def beside_steps(
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+) -> np.ndarray:  # [H, W] bool
+    """Return the pixels beside which depth jumps or ends: outlines, but no slanted surface."""
+    padded = np.pad(depth, 1, mode="reflect", reflect_type="odd")  # goes on as it does
+    across = padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * depth
+    down = padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * depth
+    return np.maximum(np.abs(across), np.abs(down)) > OUTLINE_STEP * depth
+
+
+def is_smooth(
+    before: np.ndarray,  # metres, 0 = missing, of the neighbours on one side
+    depth: np.ndarray,  # of the pixels
+    after: np.ndarray,  # of the neighbours on the other side
+) -> np.ndarray:  # bool
+    """Return where all three depths exist and the surface goes on through the middle one."""
+    exist = (before > 0) & (depth > 0) & (after > 0)
+    return exist & (np.abs(before + after - 2 * depth) < SMOOTH_STEP * depth)
+
+
+def beside_edges(
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+    relative_step: float,  # of neighbouring depths, as a share of the nearer one
+) -> np.ndarray:  # [H, W] bool
+    """Return the pixels on both sides of a step of depth to a neighbour, or of the end of depth."""
+    edge = np.zeros(depth.shape, bool)
+    for a, b, at_a, at_b in (
+        (depth[:-1], depth[1:], edge[:-1], edge[1:]),
+        (depth[:, :-1], depth[:, 1:], edge[:, :-1], edge[:, 1:]),
+    ):
+        step = np.abs(a - b) > relative_step * np.minimum(a, b)
+        at_a |= step
+        at_b |= step
+    return edge
+
+
+def without_depth_edges(
+    depth: np.ndarray,  # [H, W] metres, 0 = missing
+    relative_step: float = FUSED_STEP,
+) -> np.ndarray:  # [H, W] metres
+    """Return depth without the pixels on both sides of a step to a neighbour.
+
+    Rendered depth is a mean over what a pixel covers: at an outline it lies between two surfaces, where
+    fusion would leave a skirt.
+    """
+    return np.where(beside_edges(depth, relative_step), 0, depth)
+
+
+def with_holes_filled(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+    """Return depth with large holes put behind the far side of what surrounds them.
+
+    A sensor sees nothing in windows and beyond its range; something is there all the same, and it is not in
+    front. Narrow holes (shadows of the sensor's projector, noise at edges) stay: another view sees them.
+    """
+    missing = (depth <= 0).astype(np.uint8)
+    holes = cv2.morphologyEx(missing, cv2.MORPH_OPEN, np.ones((HOLE_WIDTH, HOLE_WIDTH), np.uint8))
+    filled = depth.copy()
+    number, labels, boxes, _ = cv2.connectedComponentsWithStats(holes)
+    reach = 2 * (HOLE_WIDTH // 2) + 1  # beyond what opening has removed of the rim
+    for label in range(1, number):
+        left, top, width, height, _ = boxes[label]
+        box = np.s_[max(top - reach, 0) : top + height + reach, max(left - reach, 0) : left + width + reach]
+        hole = (labels[box] == label).astype(np.uint8)
+        near = cv2.dilate(hole, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        around = depth[box][near & (depth[box] > 0)]
+        if len(around):
+            gap = near & (depth[box] <= 0)
+            filled[box][gap] = BEHIND * np.percentile(around, FAR_SIDE)
+    return filled
+
+
+def _corners(image: np.ndarray) -> list[np.ndarray]:  # four [H / 2, W / 2]
+    """Return the four pixels under every pixel of the image at half size."""
+    h, w = (n // 2 for n in image.shape)
+    return [image[y : 2 * h : 2, x : 2 * w : 2] for y in (0, 1) for x in (0, 1)]
+
+
+def _blocks(image: np.ndarray, reduction: int) -> np.ndarray:  # [H, W] -> [H / r, r, W / r, r]
+    h, w = image.shape[0] // reduction, image.shape[1] // reduction
+    return image[: h * reduction, : w * reduction].reshape(h, reduction, w, reduction)
+
+
+def _is_one_surface(low: np.ndarray, high: np.ndarray, share: float) -> np.ndarray:
+    """Return where the least and the largest depth of a block exist and differ by less than a share."""
+    return (low > 0) & (high - low < share * high)

@@ -1,0 +1,236 @@
+"""Errors of an estimated path against the true one, through evo, and the alignments that they rest on.
+
+Peers call different things ATE, so every variant has a name of its own: SE(3) or Sim(3) alignment; rmse,
+mean, median or maximum.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.errors import DataError
+from edslam_ti.geometry import orthonormalized
+from edslam_ti.trajectory import Trajectory
+
+LONGEST_TRUTH_GAP = 0.5  # s: motion capture drops out; truth is not interpolated over longer gaps
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Errors of an estimated path against the truth at its own times (Eq. 9 between the truth's stamps).
+
+    ATE: distance of positions after Umeyama alignment of all poses, with rotation and translation (SE(3)) or
+    scale too (Sim(3)). RPE: error of the motion between consecutive poses, of the path without scaling.
+    """
+
+    timestamps: np.ndarray  # [P] s, the poses compared
+    indices: np.ndarray  # [P] of the poses compared in the estimate
+    T_truth_estimate: np.ndarray  # [4, 4] SE(3) alignment
+    aligned_positions: np.ndarray  # [P, 3] m, estimate in the truth's frame, SE(3)
+    true_positions: np.ndarray  # [P, 3] m
+    errors_cm: np.ndarray  # [P] SE(3)
+    errors_sim3_cm: np.ndarray  # [P]
+    motion_errors_cm: np.ndarray  # [P - 1] RPE, translation
+    motion_errors_deg: np.ndarray  # [P - 1] RPE, rotation angle
+    scale: float  # by which Sim(3) alignment multiplies the estimate
+
+    @property
+    def num_poses(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def ate_rmse_cm(self) -> float:
+        return _rms(self.errors_cm)
+
+    @property
+    def ate_mean_cm(self) -> float:
+        return float(self.errors_cm.mean())
+
+    @property
+    def ate_median_cm(self) -> float:
+        return float(np.median(self.errors_cm))
+
+    @property
+    def ate_max_cm(self) -> float:
+        return float(self.errors_cm.max())
+
+    @property
+    def ate_rmse_sim3_cm(self) -> float:
+        return _rms(self.errors_sim3_cm)
+
+    @property
+    def rpe_trans_cm(self) -> float:
+        """Rmse between consecutive poses."""
+        return _rms(self.motion_errors_cm)
+
+    @property
+    def rpe_rot_deg(self) -> float:
+        """Rmse between consecutive poses."""
+        return _rms(self.motion_errors_deg)
+
+
+def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
+    """Compare the poses of an estimate whose times the truth covers with the truth at those times."""
+    from evo.core.metrics import APE, RPE, PoseRelation
+    from evo.core.trajectory import PosePath3D
+
+    common = _common_times(estimate, truth)
+    if common.sum() < 3:
+        raise DataError(
+            f"trajectory: expected at least 3 poses at times that the truth covers, got {common.sum()} of "
+            f"{len(estimate)} ({_span(estimate)}; truth {_span(truth)}); are both in seconds, on one clock?"
+        )
+    timestamps = estimate.timestamps[common]
+    estimated = np.array([orthonormalized(T) for T in estimate.poses[common]])
+    true = truth.resampled(timestamps).poses
+    reference = PosePath3D(poses_se3=list(true))
+    aligned, errors, rigid = [], [], np.eye(4)
+    for with_scale in (False, True):
+        R, t, scale = align(estimated, true, with_scale)
+        if not with_scale:
+            rigid[:3, :3], rigid[:3, 3] = R, t
+        moved = np.tile(np.eye(4), (len(estimated), 1, 1))
+        moved[:, :3, :3] = R @ estimated[:, :3, :3]
+        moved[:, :3, 3] = scale * estimated[:, :3, 3] @ R.T + t
+        ape = APE(PoseRelation.translation_part)
+        ape.process_data((reference, PosePath3D(poses_se3=list(moved))))
+        aligned.append(moved[:, :3, 3])
+        errors.append(100 * np.asarray(ape.error))
+    motion = {}
+    for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
+        rpe = RPE(relation)  # over one frame
+        rpe.process_data((reference, PosePath3D(poses_se3=list(estimated))))
+        motion[relation] = np.asarray(rpe.error)
+    return TrajectoryErrors(
+        timestamps=timestamps,
+        indices=np.flatnonzero(common),
+        T_truth_estimate=rigid,
+        aligned_positions=aligned[0],
+        true_positions=true[:, :3, 3],
+        errors_cm=errors[0],
+        errors_sim3_cm=errors[1],
+        motion_errors_cm=100 * motion[PoseRelation.translation_part],
+        motion_errors_deg=motion[PoseRelation.rotation_angle_deg],
+        scale=scale,
+    )
+
+
+def ate_rmse_cm(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> float | None:
+    """Return the ATE of `TrajectoryErrors` alone, 20 times as fast; None below three common poses."""
+    common = _common_times(estimate, truth)
+    if common.sum() < 3:
+        return None
+    estimated = estimate.poses[common]
+    true = truth.resampled(estimate.timestamps[common]).poses
+    R, t, scale = align(estimated, true, with_scale)
+    distances = np.linalg.norm(scale * estimated[:, :3, 3] @ R.T + t - true[:, :3, 3], axis=1)
+    return 100 * _rms(distances)
+
+
+def align(
+    estimated: np.ndarray,  # [P, 4, 4]
+    true: np.ndarray,  # [P, 4, 4]
+    with_scale: bool = False,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return R [3, 3], t [3], s that bring the estimated positions closest to the true ones: s R p + t.
+
+    Umeyama 1991 through evo. Positions on a line (a slider) or at one point leave R free, which evo refuses:
+    among the rotations that fit the positions equally well, the one that fits the orientations is taken.
+    """
+    from evo.core.geometry import GeometryException, umeyama_alignment
+
+    p, q = estimated[:, :3, 3], true[:, :3, 3]
+    try:
+        R, t, scale = umeyama_alignment(p.T, q.T, with_scale)
+        if np.isfinite(scale):
+            return R, t, float(scale)
+    except GeometryException:
+        pass
+    centred_p, centred_q = p - p.mean(0), q - q.mean(0)
+    covariance = centred_q.T @ centred_p
+    orientations = np.einsum("nij,nkj->ik", true[:, :3, :3], estimated[:, :3, :3])
+    tie_break = 1e-6 * (np.linalg.norm(covariance) + 1e-12) / len(p)
+    U, _, Vt = np.linalg.svd(covariance + tie_break * orientations)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    spread = float((centred_p**2).sum())
+    scale = float((R * covariance).sum()) / spread if with_scale and spread > 1e-12 else 1.0
+    return R, q.mean(0) - scale * R @ p.mean(0), scale
+
+
+def align_views(
+    estimated: np.ndarray,  # [P, 4, 4]
+    true: np.ndarray,  # [P, 4, 4]
+    distance: float = 1.0,  # metres to what the cameras see
+) -> np.ndarray:  # [4, 4]
+    """Return the rigid motion from the estimate's frame to the truth's under which the cameras see alike.
+
+    Positions alone leave the rotation loose where the path is short: 1 mm over 10 cm is half a degree,
+    two pixels. Here the points `distance` metres along the axes of every camera are brought together, too:
+    Procrustes with the orientations added to the covariance of the positions.
+    """
+    p, q = estimated[:, :3, 3], true[:, :3, 3]
+    covariance = (q - q.mean(0)).T @ (p - p.mean(0))
+    covariance += distance**2 * np.einsum("nij,nkj->ik", true[:, :3, :3], estimated[:, :3, :3])
+    U, _, Vt = np.linalg.svd(covariance)
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[:3, 3] = q.mean(0) - T[:3, :3] @ p.mean(0)
+    return T
+
+
+def statistics(errors: np.ndarray) -> dict[str, float]:
+    """Return the seven numbers that evo prints, in its order."""
+    return {
+        "max": float(errors.max()),
+        "mean": float(errors.mean()),
+        "median": float(np.median(errors)),
+        "min": float(errors.min()),
+        "rmse": _rms(errors),
+        "sse": float((errors**2).sum()),
+        "std": float(errors.std()),
+    }
+
+
+def _common_times(estimate: Trajectory, truth: Trajectory) -> np.ndarray:  # [F] bool
+    """Return which poses of the estimate lie inside the truth and not in a gap of it."""
+    stamps, times = truth.timestamps, estimate.timestamps
+    if len(stamps) < 2 or len(times) == 0:
+        return np.isin(times, stamps)
+    steps = np.diff(stamps)
+    k = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(steps) - 1)
+    at_a_stamp = np.minimum(np.abs(times - stamps[k]), np.abs(times - stamps[k + 1])) < 1e-6
+    inside = (times >= stamps[0]) & (times <= stamps[-1])
+    return at_a_stamp | (inside & (steps[k] <= max(LONGEST_TRUTH_GAP, 3 * float(np.median(steps)))))
+
+
+def _span(trajectory: Trajectory) -> str:
+    t = trajectory.timestamps
+    return f"{t[0]:.6g} to {t[-1]:.6g} s" if len(t) else "empty"
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+# Slices of EventReplica's scenes that IncEventGS evaluates on, as (first, end) of every second written pose
+# (configs/SimuEvent/replica_*.yaml of WU-CVGL/IncEventGS at 28d070f).
+INCEVENTGS_SLICES = {
+    "office0": (10, 60),
+    "office2": (350, 400),
+    "office3": (100, 150),
+    "room0": (90, 140),
+    "room2": (20, 70),
+}
+
+
+def inceventgs_slice(
+    scene: str, truth: Trajectory, estimate: Trajectory
+) -> tuple[float, float] | None:  # seconds
+    """Return IncEventGS's slice of one of EventReplica's scenes; None: the estimate does not cover it."""
+    first, end = (2 * k for k in INCEVENTGS_SLICES.get(scene, (0, 0)))
+    if end == 0 or end >= len(truth):
+        return None
+    start, stop = float(truth.timestamps[first]), float(truth.timestamps[end])
+    tolerance = 0.1  # seconds; the first sample comes a little after the first event
+    covered = estimate.timestamps[0] <= start + tolerance and estimate.timestamps[-1] >= stop - tolerance
+    return (start, stop) if covered else None

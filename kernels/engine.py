@@ -1,0 +1,61 @@
+"""The one file that imports Taichi, or the fork of it that EDSLAM_ENGINE names: `taichi` or `quadrants`.
+
+Kernels write `from edslam_ti.kernels.engine import ti`. The choice holds for the whole process and is made
+when this file is first imported. Both engines share the API that the kernels use.
+"""
+
+import contextlib
+import importlib
+import os
+from collections.abc import Iterator
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from edslam_ti.kernels.compiled_cache import home
+
+DEFAULT = "taichi"
+ENGINES = {  # how each is installed
+    "taichi": "pip install 'taichi>=1.7.4,<1.8'",
+    "quadrants": "pip install 'edslam-ti[quadrants]'",
+}
+
+
+def _load(name: str) -> ModuleType:
+    """Return the engine's module, loaded without its banner; raise ImportError with what to do."""
+    if name not in ENGINES:
+        raise ImportError(f"EDSLAM_ENGINE: expected {' or '.join(map(repr, ENGINES))}, got {name!r}")
+    try:
+        with _without_banner(name):
+            return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise ImportError(f"EDSLAM_ENGINE={name}: {name} is not installed; {ENGINES[name]}") from error
+
+
+@contextlib.contextmanager
+def _without_banner(name: str) -> Iterator[None]:
+    """Import without a printed banner, and leave the environment as it was.
+
+    Engines look at the stream of standard output when they are imported, so it is not redirected.
+    """
+    variable = f"ENABLE_{name.upper()}_HEADER_PRINT"
+    if variable in os.environ:
+        yield
+        return
+    os.environ[variable] = "0"
+    try:
+        yield
+    finally:
+        del os.environ[variable]
+
+
+os.environ.setdefault("HOME", home())  # without it, engines abort while they are imported or started
+ENGINE = os.environ.get("EDSLAM_ENGINE") or DEFAULT
+
+if TYPE_CHECKING:
+    import taichi as ti
+else:
+    ti = _load(ENGINE)
+
+VERSION = ".".join(map(str, ti.__version__))

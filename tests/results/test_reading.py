@@ -1,0 +1,33 @@
+"""A results folder is read back, or refused with the name of what is wrong."""
+
+from pathlib import Path
+
+import pytest
+from saved_results import curve, write_result
+
+from edslam_ti.errors import DataError
+from edslam_ti.results.reading import load_result
+from edslam_ti.trajectory import write_tum
+
+
+def test_result_has_a_title_with_its_error(tmp_path: Path) -> None:
+    result = load_result(write_result(tmp_path))
+    assert result.title == "office0 ed_slam: ATE 0.42 cm rmse"
+    assert result.mesh is not None
+    assert result.points is not None
+    assert len(result.points) == 500
+
+
+def test_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not a results folder"):
+        load_result(tmp_path)
+    with pytest.raises(FileNotFoundError, match="results folder not found"):
+        load_result(tmp_path / "absent")
+
+
+@pytest.mark.parametrize("name", ["points.ply", "mesh.ply", "metrics.json"])
+def test_broken_parts_of_a_result_are_named(tmp_path: Path, name: str) -> None:
+    write_tum(curve(), tmp_path / "trajectory_tum.txt")
+    (tmp_path / name).write_bytes(b"garbage")
+    with pytest.raises(DataError, match=name):
+        load_result(tmp_path)

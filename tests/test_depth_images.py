@@ -1,0 +1,92 @@
+"""Depth images: reduced without mixing surfaces, holes filled, edges found."""
+
+import numpy as np
+import pytest
+
+from edslam_ti.camera import Camera
+from edslam_ti.depth_images import (
+    beside_edges,
+    beside_steps,
+    block_depth,
+    block_means,
+    downscaled,
+    downscaled_depth,
+    is_smooth,
+    with_holes_filled,
+    without_depth_edges,
+)
+
+
+def test_steps_are_found_on_both_sides_and_not_on_a_slanted_plane() -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    plane = (-2.0 / (camera.rays() @ np.array([0.8, 0.0, -0.6]))).astype(np.float32)  # 1.7 to 10 m away
+    assert not beside_steps(plane).any()
+    step = np.full(camera.shape, 2.0, np.float32)
+    step[20:, 30:] = 2.1
+    expected = np.zeros(camera.shape, bool)
+    expected[20:, 29:31] = expected[19:21, 30:] = True
+    assert (beside_steps(step) == expected).all()
+
+
+def test_large_holes_lie_behind_what_surrounds_them_and_narrow_ones_stay() -> None:
+    depth = np.full((60, 80), 2.0, np.float32)
+    depth[:, 40:] = 3.0
+    depth[10:40, 30:60] = 0  # a window
+    depth[50, :] = 0  # a line that the sensor missed
+    filled = with_holes_filled(depth)
+    assert filled[10:40, 30:60] == pytest.approx(1.25 * 3.0)
+    assert (filled[50] == 0).all()
+    measured = depth > 0
+    assert (filled[measured] == depth[measured]).all()
+    assert (with_holes_filled(np.zeros_like(depth)) == 0).all()  # nothing to go by
+
+
+def test_both_sides_of_a_depth_step_are_left_out() -> None:
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[:, 4:] = 1.5
+    depth[2, 1] = 0
+    kept = without_depth_edges(depth)
+    expected = depth.copy()
+    expected[:, 3:5] = 0
+    assert np.array_equal(kept[[0, 5]], expected[[0, 5]])
+    assert np.array_equal(kept[:, 5:], depth[:, 5:])
+    slanted = np.tile(np.linspace(1.0, 1.3, 8, dtype=np.float32), (6, 1))  # 4 % a pixel
+    assert np.array_equal(without_depth_edges(slanted), slanted)
+
+
+def test_block_means_cut_odd_edges() -> None:
+    image = np.arange(15, dtype=np.float32).reshape(3, 5)
+    np.testing.assert_array_equal(block_means(image, 2), [[3.0, 5.0]])
+    assert block_means(image, 1) is image
+
+
+def mixed_blocks() -> np.ndarray:
+    """Return blocks of 2 x 2 depths: a plane, a hole, an edge, and a slant of 4 %."""
+    depth = np.full((2, 8), 2.0, np.float32)
+    depth[0, 2] = 0
+    depth[1, 5] = 2.2
+    depth[0, 6] = 2.08
+    return depth
+
+
+def test_depth_is_reduced_only_where_a_block_lies_on_one_surface() -> None:
+    for reduced in (downscaled_depth(mixed_blocks()), block_depth(mixed_blocks(), 2)):
+        np.testing.assert_allclose(reduced, [[2.0, 0.0, 0.0, 2.02]], rtol=1e-6)
+    assert block_depth(mixed_blocks(), 1)[0, 2] == 0
+
+
+def test_images_are_halved_to_the_means_of_blocks() -> None:
+    image = np.random.default_rng(0).random((6, 9)).astype(np.float32)
+    np.testing.assert_allclose(downscaled(image), block_means(image, 2), rtol=1e-6)
+    assert downscaled(image).dtype == np.float32
+
+
+def test_a_surface_goes_on_through_a_slant_but_not_over_a_step_or_a_hole() -> None:
+    before, depth, after = np.array([[1.9, 2.0, 0.0, 2.0], [2.0] * 4, [2.1, 2.1, 2.0, 2.01]])
+    assert is_smooth(before, depth, after).tolist() == [True, False, False, True]
+
+
+def test_edges_are_the_pixels_on_both_sides_of_a_step() -> None:
+    depth = np.array([[2.0, 2.0, 2.1, 2.1, 0.0]])
+    assert beside_edges(depth, 0.04).tolist() == [[False, True, True, True, True]]
+    assert beside_edges(depth, 0.06).tolist() == [[False, False, False, True, True]]

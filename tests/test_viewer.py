@@ -1,0 +1,159 @@
+"""Viewers: what the window draws, where it opens, and what happens without a display."""
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edslam_ti.camera import Camera
+from edslam_ti.errors import EdSlamError
+from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.trajectory import Trajectory
+from edslam_ti.viewer import (
+    KEYFRAME_COLOUR,
+    VIEWERS,
+    Open3dViewer,
+    fill_cloud,
+    fill_lines,
+    frustum_lines,
+    path_lines,
+)
+
+CAMERA = Camera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+
+
+def curve(count: int = 40) -> Trajectory:
+    times = np.linspace(0, 2, count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = np.stack([np.sin(times), 0.1 * times, 0.3 * np.cos(2 * times)], -1)
+    poses[:, :3, :3] = Rotation.from_rotvec(times[:, None] * [0, 0.2, 0]).as_matrix()
+    return Trajectory(times, poses)
+
+
+PATH = curve()
+
+
+class Window:
+    """Open3D's window without a screen: it keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.shapes: list[Any] = []
+        self.num_updates = 0
+        self.parameters: Any = None
+
+    def create_window(self, window_name: str, width: int, height: int) -> bool:
+        return True
+
+    def add_geometry(self, shape: Any, reset_bounding_box: bool) -> None:
+        self.shapes.append(shape)
+
+    def update_geometry(self, shape: Any) -> None:
+        assert any(shape is shown for shown in self.shapes)
+        self.num_updates += 1
+
+    def get_view_control(self) -> "Window":
+        return self
+
+    def convert_from_pinhole_camera_parameters(self, parameters: Any, allow_arbitrary: bool) -> bool:
+        self.parameters = parameters
+        return True
+
+    def poll_events(self) -> None:
+        pass
+
+    def update_renderer(self) -> None:
+        pass
+
+    def destroy_window(self) -> None:
+        self.shapes.clear()
+
+
+class DotMapper:
+    """As much of a mapper as a viewer asks for: three points, and the keyframes it is told."""
+
+    def __init__(self, keyframes: list[int]) -> None:
+        self._keyframes = keyframes
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.eye(3), np.full(3, 0.5)
+
+    def keyframe_indices(self) -> list[int]:
+        return self._keyframes
+
+
+@pytest.fixture
+def window(monkeypatch: pytest.MonkeyPatch) -> Window:
+    window = Window()
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(load_open3d().visualization, "Visualizer", lambda: window)
+    return window
+
+
+def test_window_without_display_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not sys.platform.startswith("linux"):
+        pytest.skip("displays are announced by the environment on Linux only")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(EdSlamError, match="no display"):
+        VIEWERS["open3d"]()
+
+
+def test_without_a_viewer_nothing_is_asked_of_the_map() -> None:
+    viewer = VIEWERS["none"]()
+    viewer.update(PATH, None, CAMERA)
+    viewer.close()
+
+
+def test_window_shows_path_keyframes_and_points(window: Window) -> None:
+    viewer = Open3dViewer()
+    viewer.update(PATH, DotMapper([0, 7]), CAMERA)  # type: ignore[arg-type]
+    path, frusta, cloud = window.shapes
+    assert len(path.lines) == 39
+    assert len(frusta.lines) == 8 * 3  # two keyframes and the newest pose
+    np.testing.assert_allclose(np.asarray(frusta.colors)[0], [0xD5 / 255, 0x5E / 255, 0])
+    assert KEYFRAME_COLOUR == "#D55E00"
+    assert len(cloud.points) == 3
+    viewer.update(PATH, DotMapper([0, 7, 9]), CAMERA)  # type: ignore[arg-type]
+    assert len(window.shapes) == 3  # refilled, not added again
+    assert len(frusta.lines) == 8 * 4
+    assert window.num_updates == 2  # points come at every fifth frame
+    viewer.close()
+    assert window.shapes == []
+
+
+def test_map_without_keyframes_shows_every_tenth_frame(window: Window) -> None:
+    viewer = Open3dViewer()
+    viewer.update(PATH, DotMapper([]), CAMERA)  # type: ignore[arg-type]
+    assert len(window.shapes[1].lines) == 8 * 5  # 0, 10, 20, 30 and the newest
+
+
+def test_window_opens_where_the_first_camera_stood(window: Window) -> None:
+    assert hasattr(load_open3d().visualization.ViewControl, "convert_from_pinhole_camera_parameters")
+    start = Trajectory(PATH.timestamps[5:], PATH.poses[5:])
+    Open3dViewer().update(start, None, CAMERA)
+    np.testing.assert_allclose(np.linalg.inv(window.parameters.extrinsic), start.pose(0), atol=1e-12)
+    intrinsic = window.parameters.intrinsic
+    assert (intrinsic.width, intrinsic.height) == (1280, 720)
+
+
+def test_frustum_opens_from_the_camera_along_its_view() -> None:
+    T = PATH.pose(20)
+    lines = np.array(frustum_lines(T, CAMERA, size=0.1))  # [8, 2, 3]
+    in_camera = (lines - T[:3, 3]) @ T[:3, :3]
+    np.testing.assert_allclose(in_camera[4:, 0], 0, atol=1e-12)  # four edges leave the centre,
+    np.testing.assert_allclose(in_camera[:4, :, 2], 0.1)  # four lie in the image plane
+    # The corners are those of the outer pixels: half a pixel beyond the first and last centres.
+    assert np.ptp(in_camera[:4, :, 0]) == pytest.approx(0.1 * CAMERA.width / CAMERA.fx)
+
+
+def test_window_geometry_holds_paths_and_points() -> None:
+    o3d = load_open3d()
+    lines, cloud = o3d.geometry.LineSet(), o3d.geometry.PointCloud()
+    fill_lines(o3d, lines, path_lines(PATH.poses[:, :3, 3]), "#0072B2")
+    assert len(lines.lines) == 39
+    fill_lines(o3d, lines, path_lines(PATH.poses[:10][:, :3, 3]), "#0072B2")  # refilled, not appended
+    assert len(lines.lines) == len(lines.colors) == 9
+    fill_cloud(o3d, cloud, np.zeros((3, 3)), np.array([-1.0, 0.5, 2.0]))
+    np.testing.assert_allclose(np.asarray(cloud.colors)[:, 0], [0, 0.5, 1])
