@@ -1,6 +1,7 @@
 """Levenberg-Marquardt on SE(3): alignment of images and depth, whatever is aligned to what (Eq. 5)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -30,6 +31,8 @@ def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualMode
 
 def is_observed(system: NormalEquations) -> bool:
     """Return whether all six motions show in what is aligned (well-conditioned normal equations)."""
+    if not np.isfinite(system.H).all():
+        return False
     eigenvalues = np.linalg.eigvalsh(system.H)
     return bool(eigenvalues[0] > eigenvalues[-1] / MAX_CONDITION)
 
@@ -51,6 +54,15 @@ def linearised(
     return linearise
 
 
+def gauss_newton_step(system: NormalEquations) -> np.ndarray | None:  # [6]
+    """Return the twist that minimises a linearised system; None: it has no single minimum."""
+    try:
+        step = -np.linalg.solve(system.H, system.g)
+    except np.linalg.LinAlgError:
+        return None
+    return step if np.isfinite(step).all() else None
+
+
 def levenberg_marquardt(
     linearise: Callable[[np.ndarray], NormalEquations],
     T_world_camera: np.ndarray,  # [4, 4] start
@@ -67,7 +79,10 @@ def levenberg_marquardt(
         if system.num_surface < MIN_PIXELS or system.cost == 0:
             break
         H = system.H + np.diag(damping * system.H.diagonal() + 1e-9)
-        candidate_T = T @ se3_exp(-np.linalg.solve(H, system.g))
+        step = gauss_newton_step(replace(system, H=H))
+        if step is None:  # nothing to align: the caller sees that no motion is observed
+            break
+        candidate_T = T @ se3_exp(step)
         candidate = linearise(candidate_T)
         gain = 1 - _mean_cost(candidate) / _mean_cost(system)
         if gain > 0:

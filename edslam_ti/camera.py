@@ -4,7 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edslam_ti.errors import DataError
+from edslam_ti.errors import DataError, plain
+
+LARGEST_SIDE = 32767  # pixels; events hold 16-bit coordinates
+SHORTEST_FOCAL, LONGEST_FOCAL = (
+    1e-3,
+    1e3,
+)  # longer sides; beyond any fisheye, any telescope
+FARTHEST_CENTRE = 10  # longer sides; cut-outs have their centre outside
 
 NEAREST = 0.05  # metres: what is nearer than this does not count as in view
 
@@ -21,12 +28,28 @@ class Camera:
     cy: float
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise DataError(f"camera: expected a positive size, got {self.width}x{self.height}")
+        if not (1 <= self.width <= LARGEST_SIDE and 1 <= self.height <= LARGEST_SIDE):
+            raise DataError(
+                f"camera: expected a size of 1 to {LARGEST_SIDE} pixels, got "
+                f"{plain(self.width, 20)}x{plain(self.height, 20)}"
+            )
         values = (self.fx, self.fy, self.cx, self.cy)
         if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
             raise DataError(
                 f"camera: expected finite fx, fy, cx, cy with positive focal lengths, got {values}"
+            )
+        side = max(self.width, self.height)
+        low, high = SHORTEST_FOCAL * side, LONGEST_FOCAL * side
+        if not (low <= self.fx <= high and low <= self.fy <= high):
+            raise DataError(
+                f"camera: expected focal lengths in pixels, {low:.3g} to {high:.3g} for {self.width}x"
+                f"{self.height} pixels (a usual lens has half to twice the width), got fx = {self.fx:g}, "
+                f"fy = {self.fy:g}"
+            )
+        if abs(self.cx) > FARTHEST_CENTRE * side or abs(self.cy) > FARTHEST_CENTRE * side:
+            raise DataError(
+                f"camera: expected the principal point near the {self.width}x{self.height} image, got "
+                f"cx = {self.cx:g}, cy = {self.cy:g}"
             )
 
     @property

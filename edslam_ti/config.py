@@ -13,7 +13,7 @@ import yaml
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from edslam_ti.errors import ConfigError, EdSlamError
+from edslam_ti.errors import ConfigError, EdSlamError, plain, shown
 
 CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: what a data set needs
 
@@ -248,11 +248,11 @@ class Config(Stage):
     """Seconds of the sequence to use; omitted: to its end."""
     poses: Literal["tracked", "truth"] = "tracked"
     """truth: skip tracking and map with the true poses."""
-    contrast_threshold: float | None = Field(None, gt=0)
+    contrast_threshold: float | None = Field(None, ge=1e-3, le=10)
     """C in Eq. 11; omitted: the data set's own (camera.json), else estimated from its images, else 0.1,
     for events alone do not fix it (log brightness is then known up to a factor). Given: the mean of C+
     and C-, whose ratio is estimated from the images, if there are any."""
-    max_interval: float = Field(0.05, gt=0)
+    max_interval: float = Field(0.05, ge=1e-3)
     """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
     out: Path = Path("results")
     """Folder that receives the results."""
@@ -261,7 +261,7 @@ class Config(Stage):
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the kernels run. A run refuses cuda: rendering and tracking are not right there yet; the kernels
     alone and the benchmark can use it."""
-    threads: int = Field(2, ge=1)
+    threads: int = Field(2, ge=1, le=256)
     """CPU threads of the kernels; results are identical for the same number."""
     seed: int = Field(0, ge=0)
     """Seed of every random choice."""
@@ -295,8 +295,12 @@ def read_differences(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: settings file not found")
     try:
         values = yaml.safe_load(path.read_text()) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
+    except (
+        yaml.YAMLError,
+        ValueError,
+        RecursionError,
+    ) as error:  # encoding; integers of 5000 digits; nesting
+        raise ConfigError(f"{path}: not readable as YAML ({plain(' '.join(str(error).split()))})") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping 'key: value', got {type(values).__name__}")
     values = with_present_names(Config, values)
@@ -342,10 +346,10 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
     problem = error.errors()[0]
     name = ".".join(str(part) for part in problem["loc"])
     if problem["type"] != "extra_forbidden":
-        return f"{name}: {problem['msg']}, got {problem['input']!r}"
+        return f"{name}: {problem['msg']}, got {shown(problem['input'])}"
     stage: Any = model
     for part in problem["loc"][:-1]:
         stage = stage.model_fields[part].annotation
     close = difflib.get_close_matches(str(problem["loc"][-1]), stage.model_fields, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else f"; known: {', '.join(stage.model_fields)}"
-    return f"unknown key '{name}'{hint}"
+    return f"unknown key '{plain(name, 60)}'{hint}"

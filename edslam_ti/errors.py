@@ -1,4 +1,6 @@
-"""Errors a user can mend. Each message says what was expected, what came, and what to do, in one line."""
+"""Errors a user can mend. Each message says what was expected, what came, and what to do: one short line."""
+
+import reprlib
 
 LONGEST_MESSAGE = 1000  # characters
 LONGEST_VALUE = 200  # characters of one value from a file
@@ -13,6 +15,11 @@ def plain(value: object, limit: int = LONGEST_VALUE) -> str:
     if len(text) > limit:
         text = f"{text[: limit - 4]} ..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def shown(value: object) -> str:
+    """Return a value as Python writes it, shortened: a few bytes of YAML may stand for gigabytes."""
+    return plain(reprlib.repr(value), 80)
 
 
 class EdSlamError(ValueError):

@@ -25,6 +25,7 @@ from edslam_ti.results.folder import save
 from edslam_ti.results.run import Run
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import Tracker, TruePoses
+from edslam_ti.truth import true_path
 from edslam_ti.viewer import VIEWERS, Viewer
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
@@ -102,7 +103,7 @@ def make_slam(
     if config.poses == "truth":
         if sequence.truth is None:
             raise DataError(f"{sequence.scene}: --poses truth needs true poses, and this sequence has none")
-        tracker = TruePoses(sequence.true_pose)
+        tracker = TruePoses(sequence.true_pose, true_path(sequence.truth).likely_pose_at)
     truth = sequence.true_pose(float(samples.timestamps[0]))
     return Slam(
         FrameBuilder(sequence.camera),
@@ -171,7 +172,9 @@ def _process(state: Run, interrupt: _Interrupt, viewer: Viewer, console: Console
         for k, sample in enumerate(state.samples):
             if interrupt.requested:
                 break
-            result = slam.process(sample, is_held_out=k in state.held_out)
+            # With true poses, a frame where the truth has a hole is kept from the map.
+            has_no_pose = state.config.poses == "truth" and sample.T_world_camera is None
+            result = slam.process(sample, is_held_out=has_no_pose or k in state.held_out)
             if mapper is not None:
                 release_free_memory()  # arrays of ever other sizes come and go while mapping
             state.num_events += len(sample.events)

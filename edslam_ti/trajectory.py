@@ -1,16 +1,24 @@
 """A camera path: key poses over time, interpolated along geodesics (Eq. 9), read and written as TUM."""
 
 import bisect
-import warnings
+import logging
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from edslam_ti.errors import DataError
+from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 from edslam_ti.geometry import interpolate, rotation_angle_deg
 from edslam_ti.output import atomic_file
+from edslam_ti.tables import read_table
+
+SHORTEST_QUATERNION, LONGEST_QUATERNION = 0.1, 10.0  # norms; files of few decimals are not exactly of 1
+FARTHEST = 1e7  # m from the origin: map coordinates (UTM) end there
+SAME_PLACE = 0.05  # m, entries of rotation matrices: coarse stamps repeat while the camera moves
+
+logger = logging.getLogger(__name__)
 
 
 class Trajectory:
@@ -41,6 +49,10 @@ class Trajectory:
     def pose(self, index: int) -> np.ndarray:  # [4, 4]
         """Return key pose `index`; negative counts from the end."""
         return self._poses[index]
+
+    def index_of(self, timestamp: float) -> int:
+        """Return the index of the last pose at or before a time; -1: there is none."""
+        return bisect.bisect_right(self._timestamps, timestamp) - 1
 
     def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
         """Add a pose later than all others."""
@@ -128,35 +140,105 @@ class PathDraft:
             self.corrections[index] = T_world_camera
 
 
-def write_tum(trajectory: Trajectory, path: Path) -> None:
-    """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world)."""
+def write_tum(trajectory: Trajectory, path: Path, time_offset: float = 0.0) -> None:
+    """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world).
+
+    `time_offset` seconds are added to every stamp, in decimals: stamps since the epoch come out to the
+    nanosecond, which float64 seconds do not hold.
+    """
+    offset = Decimal(time_offset)
     with atomic_file(path) as temporary, temporary.open("w") as file:
         file.write("# timestamp tx ty tz qx qy qz qw\n")
         for t, T in zip(trajectory.timestamps, trajectory.poses):
             q = Rotation.from_matrix(T[:3, :3]).as_quat()
-            file.write(f"{t:.9f} " + " ".join(f"{v:.9f}" for v in [*T[:3, 3], *q]) + "\n")
+            stamp = Decimal(f"{t:.9f}") + offset
+            file.write(f"{stamp:.9f} " + " ".join(f"{v:.9f}" for v in [*T[:3, 3], *q]) + "\n")
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory; '#' lines are comments; rows at or before the time of the last are dropped."""
+def read_tum(path: Path, notes: list[str] | None = None) -> Trajectory:
+    """Read a TUM trajectory, lines `t tx ty tz qx qy qz qw`; '#' begins a comment.
+
+    What `in_order` mends is appended to `notes`, a line each; without such a list it goes to the log.
+    Raises `FileNotFoundError` or `DataError`.
+    """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} not found")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is an error below
-            rows = np.loadtxt(path, comments="#", ndmin=2)
-    except ValueError as error:
-        raise DataError(f"{path}: expected lines 't tx ty tz qx qy qz qw'; {error}") from error
-    if rows.size == 0 or rows.shape[1] != 8:
-        raise DataError(f"{path}: expected 8 numbers a line (t tx ty tz qx qy qz qw), got {rows.shape}")
-    if not np.isfinite(rows).all():
-        raise DataError(f"{path}: holds values that are not finite; remove those lines")
+        raise FileNotFoundError(plain(f"{path} not found", LONGEST_MESSAGE))
+    table = read_table(path, 8, "t tx ty tz qx qy qz qw")
+    rows, lines = table.rows, table.lines
     norms = np.linalg.norm(rows[:, 4:], axis=1)
-    if np.any(norms < 1e-6):
-        raise DataError(f"{path}: a quaternion is zero; expected unit quaternions qx qy qz qw")
-    keep = np.concatenate([[True], rows[1:, 0] > np.maximum.accumulate(rows[:-1, 0])])
-    rows = rows[keep]
+    odd = (norms < SHORTEST_QUATERNION) | (norms > LONGEST_QUATERNION)
+    if odd.any():
+        row = int(odd.argmax())
+        raise DataError(
+            f"{path}: line {lines[row]}: expected a unit quaternion qx qy qz qw, got one of norm "
+            f"{norms[row]:.3g} ({int(odd.sum())} such lines)"
+        )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
-    return Trajectory(rows[:, 0], poses)
+    trajectory, mended = in_order(rows[:, 0], poses, lines, path)
+    for text in mended:
+        if notes is None:
+            logger.warning("%s", text)
+        else:
+            notes.append(text)
+    return trajectory
+
+
+def in_order(
+    times: np.ndarray,  # [N] seconds
+    poses: np.ndarray,  # [N, 4, 4]
+    lines: np.ndarray,  # [N] of the file, for messages
+    path: Path,
+) -> tuple[Trajectory, list[str]]:
+    """Return the path with its rows sorted by time and repeated stamps left out, and notes that say so.
+
+    Raises `DataError` for two paths in one file (second poses elsewhere for many stamps, or a path that
+    sorting makes longer), and for positions that no camera reaches.
+    """
+    position = poses[:, :3, 3]
+    far = np.abs(position).max(1) > FARTHEST
+    if far.any():
+        row = int(far.argmax())
+        raise DataError(
+            f"{path}: line {lines[row]}: expected a position in metres, got "
+            f"{', '.join(f'{v:.6g}' for v in position[row])}"
+        )
+    notes: list[str] = []
+    order = np.argsort(times, kind="stable")
+    first = order[np.searchsorted(times[order], times, side="left")]  # of the rows with a row's stamp
+    is_repeated = first != np.arange(len(times))
+    if is_repeated.any():
+        differs = is_repeated & (np.abs(poses - poses[first])[:, :3].max((1, 2)) > SAME_PLACE)
+        if differs.sum() >= 3 and differs.sum() > 0.1 * (~is_repeated).sum():
+            row = int(differs.argmax())
+            raise DataError(
+                f"{path}: line {lines[row]}: a second pose for {times[row]:.9g} s, "
+                f"{np.linalg.norm(position[row] - position[first[row]]):.3g} m from that in line "
+                f"{lines[first[row]]}, and {int(differs.sum()) - 1} more such lines; two recordings in one "
+                "file? keep one"
+            )
+        notes.append(
+            f"{path}: {int(is_repeated.sum())} of {len(times)} rows repeat a time stamp (the first in "
+            f"line {lines[int(is_repeated.argmax())]}) and are left out"
+        )
+    kept = order[~is_repeated[order]]
+    late = times < np.maximum.accumulate(times)
+    if late.any():
+        row = int(late.argmax())
+        before, after = _length(position[np.sort(kept)]), _length(position[kept])
+        if after > 1.5 * before + 0.1:
+            raise DataError(
+                f"{path}: line {lines[row]}: time goes back to {times[row]:.9g} s, and in the order of time "
+                f"the path would be {after:.3g} m long instead of {before:.3g} m; two recordings in one "
+                "file? keep one"
+            )
+        notes.append(
+            f"{path}: {int(late.sum())} of {len(times)} rows are not in the order of time (the first in "
+            f"line {lines[row]}); sorted"
+        )
+    return Trajectory(times[kept], poses[kept]), notes
+
+
+def _length(position: np.ndarray) -> float:  # [N, 3] m
+    return float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())

@@ -10,6 +10,8 @@ import pytest
 from edslam_ti.cold_start import THREADS
 from edslam_ti.kernels.engine import ENGINE, VERSION
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 MODULES = sorted(
     {

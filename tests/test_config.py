@@ -1,5 +1,6 @@
 """Settings: defaults are valid, files state differences, mistakes are named."""
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -50,3 +51,31 @@ def test_mistakes_in_a_file_are_named_in_one_line(tmp_path: Path, text: str, mes
     with pytest.raises(ConfigError, match=message) as caught:
         read_differences(tmp_path / "c.yaml")
     assert "\n" not in str(caught.value)
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in itertools.pairwise("abcdefghi")
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB.replace("\ni: &i", "\nscene: &i"), r"scene: Input should be a valid string, got \[\["),
+        ("scene: " + "x" * 1_000_000 + "\nseed: -1\n", r"seed: .*greater than or equal to 0, got -1"),
+        ("seed: '" + "9" * 1_000_000 + "x'\n", r"seed: .*, got '999.*\.\.\.999.*x'"),
+        ("? " + "x" * 1_000_000 + "\n: 1\n", r"unknown key 'xxx.* \.\.\.'"),
+        ("[" * 3000, r"not readable as YAML"),
+        ("seed: " + "9" * 5000, r"not readable as YAML"),
+        ("max_interval: 1.0e-9", r"max_interval: .*greater than or equal to 0\.001, got 1e-09"),
+        ("threads: 1000000000", r"threads: .*less than or equal to 256"),
+        ("contrast_threshold: 1.0e-300", r"contrast_threshold: .*greater than or equal to 0\.001"),
+    ],
+)
+def test_messages_about_settings_are_short(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_differences(path)
+    assert len(str(caught.value)) <= 1000
+    assert str(caught.value).isprintable()

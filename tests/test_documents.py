@@ -152,6 +152,7 @@ def entered(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> di
     return {m: functions_entered(functools.partial(run, m)) for m in ("ed_slam", "ed_slam_paper")}
 
 
+@pytest.mark.slow
 def test_every_equation_names_a_function_that_runs(entered: dict[str, set[tuple[str, str]]]) -> None:
     problems = []
     for equation, file, name, method in equations():
@@ -369,6 +370,7 @@ def test_recipe_for_a_loss() -> None:
     assert re.search(line, losses.split("def map_loss(")[1].split("\ndef ")[0])
 
 
+@pytest.mark.slow
 def test_recipe_for_a_viewer(tmp_path: Path, tiny_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
     from edslam_ti.viewer import VIEWERS

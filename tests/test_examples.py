@@ -13,6 +13,8 @@ import pytest
 from edslam_ti import kernels
 from edslam_ti.trajectory import read_tum
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 
 

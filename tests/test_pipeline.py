@@ -50,7 +50,8 @@ KEYS = {
 NAMES = [
     *("dataset", "scene", "description", "method", "ate_rmse_cm", "ate_mean_cm", "ate_median_cm"),
     *("ate_max_cm", "ate_rmse_sim3_cm", "rpe_trans_cm", "rpe_rot_deg", "ate_frontend_rmse_cm"),
-    *("path_length_m", "psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "psnr_db_all"),
+    *("path_length_m", "ate_scale_sim3", "num_truth_poses_compared", "truth_coverage", "truth_notes"),
+    *("psnr_db", "psnr_corrected_db", "ssim_corrected", "lpips_corrected", "psnr_db_all"),
     *("psnr_corrected_db_all", "ssim_corrected_all", "lpips_corrected_all", "ssim_all", "lpips_all"),
     *("depth_l1_cm", "num_held_out_views", "psnr_mapped_db", "psnr_mapped_corrected_db"),
     *("ssim_mapped_corrected", "lpips_mapped_corrected", "psnr_mapped_db_all"),
@@ -59,7 +60,14 @@ NAMES = [
     *("psnr_novel_corrected_db", "ssim_novel_corrected", "lpips_novel_corrected", "psnr_novel_db_all"),
     *("psnr_novel_corrected_db_all", "ssim_novel_corrected_all", "lpips_novel_corrected_all"),
     *("ssim_novel_all", "lpips_novel_all", "depth_l1_novel_cm", "num_novel_views", "mesh_accuracy_cm"),
-    *("mesh_completion_cm", "mesh_completion_ratio_5cm", "num_frames", "num_lost_frames", "num_keyframes"),
+    *(
+        "mesh_completion_cm",
+        "mesh_completion_ratio_5cm",
+        "time_offset_s",
+        "num_frames",
+        "num_lost_frames",
+        "num_keyframes",
+    ),
     *("num_gaussians", "num_events", "num_mapping_steps", "num_hot_pixels", "contrast_threshold"),
     *("contrast_threshold_source", "contrast_threshold_positive", "contrast_threshold_negative"),
     *("contrast_threshold_deviation", "tracking_hz", "tracking_s", "mapping_s", "refinement_s", "device"),
@@ -109,6 +117,7 @@ def recording(tiny_folder: Path, tmp_path: Path) -> Path:
 # --- what a run leaves behind ---
 
 
+@pytest.mark.slow
 def test_every_artefact_is_there_and_holds_something(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == ARTEFACTS
     assert all(path.stat().st_size > 0 for path in result.iterdir())
@@ -254,6 +263,7 @@ def test_slice_of_inceventgs_is_measured_apart(
     assert 10 < theirs["psnr_corrected_db"] != metrics["psnr_corrected_db_all"]
 
 
+@pytest.mark.slow
 def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
     values = yaml.safe_load((result / "config.yaml").read_text())
     again = quiet_run(Config().updated(values | {"out": str(tmp_path)}))
@@ -295,6 +305,7 @@ def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None
     assert metrics["num_gaussians"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("is_mapping", "expected"), [(True, 6), (False, 0)])
 def test_free_memory_is_given_back_after_every_mapped_frame(
     is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -306,6 +317,7 @@ def test_free_memory_is_given_back_after_every_mapped_frame(
     assert len(calls) == expected
 
 
+@pytest.mark.slow
 def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "open3d_rgbd"))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply"}  # it has no Gaussians
@@ -317,12 +329,14 @@ def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_p
     assert metrics["psnr_db"] > 15  # it fuses the images themselves
 
 
+@pytest.mark.slow
 def test_paper_method_runs_by_its_name(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "ed_slam_paper", mapping={"enabled": False}))
     assert folder.parent.name == "ed_slam_paper"
     assert yaml.safe_load((folder / "config.yaml").read_text())["tracking"]["depth_weight"] == 0
 
 
+@pytest.mark.slow
 def test_true_poses_have_no_error(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, poses="truth"))
     metrics = metrics_of(folder)
@@ -344,6 +358,7 @@ def test_lpips_weights_give_a_perceptual_distance(
 # --- data that lacks something ---
 
 
+@pytest.mark.slow
 def test_recording_of_events_and_depth_alone_runs_without_metrics(recording: Path, tmp_path: Path) -> None:
     shutil.rmtree(recording / "images")
     for name in ("poses_ts.txt", "traj.txt"):
@@ -366,18 +381,33 @@ def test_true_poses_without_truth_are_an_error(recording: Path, tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
-def test_depth_that_is_all_zero_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
+def test_depth_that_is_all_zero_is_refused_before_the_first_frame(recording: Path, tmp_path: Path) -> None:
     for path in (recording / "depth").iterdir():
         cv2.imwrite(str(path), np.zeros((80, 120), np.uint16))
+    with pytest.raises(DataError, match="depth has no variation: every pixel is missing"):
+        quiet_run(config_for(recording, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_depth_of_two_pixels_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
+    depth = np.zeros((80, 120), np.uint16)
+    depth[0, :2] = 5000, 9000
+    for path in (recording / "depth").iterdir():
+        cv2.imwrite(str(path), depth)
     folder = quiet_run(config_for(recording, tmp_path))
+    assert len(read_tum(folder / "trajectory_tum.txt")) == 14
+    assert metrics_of(folder)["num_lost_frames"] == 13  # nothing to align to
+
+
+def test_a_map_that_is_empty_is_said_to_be(tiny_folder: Path, tmp_path: Path) -> None:
+    nothing_stays = {"initial_opacity": 0.1, "min_opacity": 0.99}
+    folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.3, mapping=nothing_stays))
     assert not (folder / "map.ply").exists()
     assert "the map is empty" in (folder / "log.txt").read_text()
-    assert len(read_tum(folder / "trajectory_tum.txt")) == 14
-    metrics = metrics_of(folder)
-    assert metrics["num_lost_frames"] == 13  # nothing to align to
-    assert metrics["depth_l1_cm"] is None
+    assert metrics_of(folder)["depth_l1_cm"] is None
 
 
+@pytest.mark.slow
 def test_map_without_a_surface_keeps_its_other_results(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.3, mapping={"max_gaussians": 2}))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"mesh.ply"}
@@ -399,6 +429,7 @@ def interrupt_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Slam, "process", processed)
 
 
+@pytest.mark.slow
 def test_interrupt_saves_what_there_is_and_exits_130(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -420,6 +451,7 @@ def test_interrupt_saves_what_there_is_and_exits_130(
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.slow
 def test_interrupt_while_refining_stops_it(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -455,7 +487,7 @@ def test_failed_saving_leaves_no_half_written_folder(
     def fail(*arguments: Any, **options: Any) -> None:
         raise error
 
-    monkeypatch.setattr(results, "plot_trajectory", fail)
+    monkeypatch.setattr(results, "write_tum", fail)
     config = config_for(tiny_folder, tmp_path, duration=0.2, mapping={"enabled": False})
     with pytest.raises(type(error)):
         quiet_run(config)

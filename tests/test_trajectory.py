@@ -1,6 +1,7 @@
 """Paths over time: interpolation, prediction, and the TUM format."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,38 +109,114 @@ def test_tum_line_is_time_position_and_quaternion_with_w_last(tmp_path: Path) ->
     assert [float(v) for v in line.split()] == [0.25, 1, 2, 3, 0, 0, 0, 1]
 
 
-def test_comments_and_repeated_times_are_passed_over(tmp_path: Path) -> None:
+def test_rows_are_sorted_repeated_times_left_out_and_both_are_said(tmp_path: Path) -> None:
     file = tmp_path / "t.txt"
     file.write_text(
-        "# t x y z\n0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n1 9 0 0 0 0 0 1\n0.5 9 0 0 0 0 0 1\n2 2 0 0 0 0 0 1\n"
+        "# t x y z\n0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n1 9 0 0 0 0 0 1\n0.5 0.6 0 0 0 0 0 1\n2 2 0 0 0 0 0 1\n"
     )
-    path = read_tum(file)
-    assert path.timestamps.tolist() == [0, 1, 2]
-    assert path.poses[:, 0, 3].tolist() == [0, 1, 2]
+    notes: list[str] = []
+    path = read_tum(file, notes)
+    assert path.timestamps.tolist() == [0, 0.5, 1, 2]
+    assert path.poses[:, 0, 3].tolist() == [0, 0.6, 1, 2]
+    assert notes == [
+        f"{file}: 1 of 5 rows repeat a time stamp (the first in line 4) and are left out",
+        f"{file}: 1 of 5 rows are not in the order of time (the first in line 5); sorted",
+    ]
+
+
+def test_what_is_mended_goes_to_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = constant_velocity(np.linspace(0, 5, 20))
+    write_tum(path, tmp_path / "t.txt")
+    lines = (tmp_path / "t.txt").read_text().splitlines()
+    for order in (np.arange(20)[::-1], np.random.default_rng(0).permutation(20)):
+        (tmp_path / "t.txt").write_text("\n".join(lines[k + 1] for k in order))
+        np.testing.assert_allclose(read_tum(tmp_path / "t.txt").poses, path.poses, atol=2e-9)
+    assert "rows are not in the order of time" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("delay", "message"),
+    [(0.0, r"line 21: a second pose for 0 s, 0\.5 m from that in line 1, and 19 more such lines"),
+     (0.1, r"line 21: time goes back to 0\.1 s, and in the order of time the path would be")],
+)  # fmt: skip
+def test_two_recordings_in_one_file_are_refused(tmp_path: Path, delay: float, message: str) -> None:
+    rows = [
+        f"{0.25 * k + d:.3f} {0.01 * k} {y} 0 0 0 0 1\n"
+        for y, d in ((0, 0.0), (0.5, delay))
+        for k in range(20)
+    ]
+    (tmp_path / "t.txt").write_text("".join(rows))
+    with pytest.raises(DataError, match=message + r".*two recordings in one file"):
+        read_tum(tmp_path / "t.txt")
+
+
+def test_stamps_since_the_epoch_come_back_to_the_microsecond(tmp_path: Path) -> None:
+    from evo.tools.file_interface import read_tum_trajectory_file
+
+    offset = 1642650000.0
+    path = constant_velocity(np.array([0.00066, 0.05, 0.100001]))
+    write_tum(path, tmp_path / "t.txt", time_offset=offset)
+    stamps = [line.split()[0] for line in (tmp_path / "t.txt").read_text().splitlines()[1:]]
+    assert stamps == ["1642650000.000660000", "1642650000.050000000", "1642650000.100001000"]
+    for back in (read_tum(tmp_path / "t.txt").timestamps,
+                 read_tum_trajectory_file(str(tmp_path / "t.txt")).timestamps):  # fmt: skip
+        np.testing.assert_allclose(back - offset, path.timestamps, rtol=0, atol=5e-7)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n", "\r"),
+        lambda text: "\ufeff" + text,
+        lambda text: "# caf\udce9\n#! x\n\n" + text.replace("\n", "  # end\n"),
+        lambda text: text.replace(" ", "\t  "),
+    ],
+)
+def test_line_ends_comments_and_byte_order_marks_are_passed_over(tmp_path: Path, change: Any) -> None:
+    path = constant_velocity(np.linspace(0, 5, 20))
+    write_tum(path, tmp_path / "t.txt")
+    text = change("\n".join((tmp_path / "t.txt").read_text().splitlines()[1:]) + "\n")
+    (tmp_path / "t.txt").write_bytes(text.encode("utf-8", "surrogateescape"))
+    np.testing.assert_allclose(read_tum(tmp_path / "t.txt").poses, path.poses, atol=2e-9)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "8 numbers a line"),
-        ("# nothing\n", "8 numbers a line"),
-        ("0 1 2 3\n", "8 numbers a line"),
-        ("a b c d e f g h\n", "expected lines"),
-        ("0 0 0 0 0 0 0 1\n1 0 0\n", "expected lines"),
-        ("0 nan 0 0 0 0 0 1\n", "not finite"),
-        ("0 0 0 0 0 0 0 0\n", "quaternion is zero"),
+        ("", "expected lines 't tx .*', got an empty file"),
+        ("# nothing\n", "expected lines 't tx .*', got an empty file"),
+        ("0 1 2 3\n", "line 1: expected 8 numbers a line 't tx .*', got 4: '0 1 2 3'"),
+        ("a b c d e f g h\n", "line 1: expected 8 numbers a line .*, got 'a'"),
+        ("0 0 0 0 0 0 0 1\n\n1 0 0\n", "line 3: expected 8 numbers a line .*, got 3"),
+        ("0,0,0,0,0,0,0,1\n", "line 1: expected 8 .* with blanks between them, got commas"),
+        ("0 nan 0 0 0 0 0 1\n", "line 1: expected 8 .* finite .* got nan"),
+        ("0 1e400 0 0 0 0 0 1\n", "line 1: expected 8 .* finite .* got 1e400"),
+        ("0 0 0 0 0 0 0 1\n1e308 1 0 0 0 0 0 1\n", "line 2: .* below 1e\\+20, got 1e308"),
+        ("0 1e19 0 0 0 0 0 1\n", "line 1: expected a position in metres, got 1e\\+19, 0, 0"),
+        ("0 1_0 0 0 0 0 0 1\n", "line 1: .* got '1_0'"),
+        ("0 \u0663 0 0 0 0 0 1\n", "line 1: .* got '\u0663'"),
+        ("0 0 0 0 0 0 0 0\n", "line 1: expected a unit quaternion qx qy qz qw, got one of norm 0"),
+        ("# t\n0 0 0 0 0 0 0 1e19\n", "line 2: expected a unit quaternion .* norm 1e\\+19"),
+        ("0 0 0 0 \0 0 0 1\n", "line 1: .* got zero bytes"),
+        ("1 " * 100_000, "line 1: expected 8 numbers a line .*, got 100000: '1 1 .* \\.\\.\\.'"),
     ],
 )
 def test_broken_tum_files_are_refused_in_one_line(tmp_path: Path, content: str, message: str) -> None:
     file = tmp_path / "t.txt"
-    file.write_text(content)
-    with pytest.raises(DataError, match=message):
+    file.write_text(content, encoding="utf-8")
+    with pytest.raises(DataError, match=message) as caught:
         read_tum(file)
+    assert len(str(caught.value)) < 1001
+    assert str(caught.value).isprintable()
 
 
 def test_absent_and_binary_tum_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="absent"):
         read_tum(tmp_path / "absent.txt")
+    (tmp_path / "wide.txt").write_text("0 0 0 0 0 0 0 1\n", encoding="utf-16")
+    with pytest.raises(DataError, match=r"wide\.txt: .* UTF-16; save it as UTF-8"):
+        read_tum(tmp_path / "wide.txt")
     (tmp_path / "binary.txt").write_bytes(bytes(range(128, 256)))
     with pytest.raises(DataError, match=r"binary\.txt"):
         read_tum(tmp_path / "binary.txt")

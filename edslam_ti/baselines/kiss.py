@@ -50,3 +50,6 @@ class KissIcpTracker:
         if self._T_world_start is None:
             self._T_world_start = T_world_camera_guess
         return TrackingResult(self._T_world_start @ np.asarray(self._odometry.last_pose), True, 1.0)
+
+    def consistency(self, trajectory: Trajectory) -> None:
+        """Return nothing: it does not compare its data."""

@@ -71,6 +71,9 @@ class OdometryTracker:
         message = "" if converged else f"only {fitness:.0%} of pixels found a partner: pose predicted"
         return TrackingResult(pose, converged, fitness, message)
 
+    def consistency(self, trajectory: Trajectory) -> None:
+        """Return nothing: it does not compare its data."""
+
     def _align(self, current: Any, reference: Any, T_guess: np.ndarray) -> tuple[np.ndarray, float]:
         """Return T_reference_camera and the fraction of pixels that support it."""
         o3d = load_open3d()

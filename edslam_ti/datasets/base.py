@@ -5,14 +5,16 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from edslam_ti.camera import Camera
-from edslam_ti.errors import DataError
+from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_path
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class EventDepthSequence(ABC):
     `time_range` is that of the depth images.
 
     Constructors validate what they can see without reading everything, and raise `DataError` or
-    `FileNotFoundError`; reading methods raise `DataError` on what only then shows.
+    `FileNotFoundError`; reading methods raise `DataError` on what only then shows. One image that cannot be
+    used is no reason to lose a run: `depth_or_none` and `image_or_none` leave it out and add to `notes`.
     """
 
     dataset: str
@@ -59,6 +62,18 @@ class EventDepthSequence(ABC):
     has_events: bool = True
     num_dropped_events: int = 0  # rows of the events' file that were bad and left out
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
+    depth_varies: bool = False  # depth images usually show more than one value: one that does not is broken
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """What was left out or mended while reading, a line each, for the log; wrappers share the list."""
+        return []
+
+    def note(self, text: str) -> None:
+        """Add a line to `notes` that is not there yet."""
+        text = plain(text, LONGEST_MESSAGE)
+        if text not in self.notes:
+            self.notes.append(text)
 
     @abstractmethod
     def depth(self, index: int) -> np.ndarray:
@@ -67,6 +82,28 @@ class EventDepthSequence(ABC):
     @abstractmethod
     def image(self, index: int) -> np.ndarray:
         """Return grey image `index` as [H, W] float32 in [0, 1], undistorted."""
+
+    def depth_or_none(self, index: int) -> np.ndarray | None:  # [H, W] float32 metres
+        """Return depth image `index`, None with a note where it cannot be read or shows no depth."""
+        try:
+            depth = self.depth(index)
+        except (DataError, OSError) as error:
+            self.note(f"no depth at {stamp_text(self, self.depth_timestamps[index])} s: {error}")
+            return None
+        if self.depth_varies and not has_variation(depth):
+            value = float(depth.max())
+            what = f"every pixel is {value:.6g} m" if value > 0 else "every pixel is missing"
+            self.note(f"no depth at {stamp_text(self, self.depth_timestamps[index])} s: {what}")
+            return None
+        return depth
+
+    def image_or_none(self, index: int) -> np.ndarray | None:  # [H, W] float32 in [0, 1]
+        """Return grey image `index`, None with a note where it cannot be read."""
+        try:
+            return self.image(index)
+        except (DataError, OSError) as error:
+            self.note(f"no image at {stamp_text(self, self.image_timestamps[index])} s: {error}")
+            return None
 
     @abstractmethod
     def events(self, start: float, end: float) -> Events:
@@ -82,17 +119,29 @@ class EventDepthSequence(ABC):
         return []
 
     def image_at(self, timestamp: float, tolerance: float = 1e-3) -> np.ndarray | None:
-        """Return the image taken within `tolerance` seconds of a time, if there is one."""
+        """Return the image taken within `tolerance` seconds of a time, if there is one to be read."""
         if len(self.image_timestamps) == 0:
             return None
         k = int(np.abs(self.image_timestamps - timestamp).argmin())
-        return self.image(k) if abs(self.image_timestamps[k] - timestamp) <= tolerance else None
+        return self.image_or_none(k) if abs(self.image_timestamps[k] - timestamp) <= tolerance else None
 
     def true_pose(self, timestamp: float) -> np.ndarray | None:
-        """Return the true pose at a time inside the recorded path (Eq. 9 between its stamps)."""
-        if self.truth is None or not self.truth.covers(timestamp):
-            return None
-        return self.truth.at(timestamp)
+        """Return the true pose at a time, None where `true_poses_at` does not know it."""
+        return None if self.truth is None else true_path(self.truth).pose_at(timestamp)
+
+
+def stamp_text(sequence: EventDepthSequence, time: float) -> str:
+    """Return a time (s) on the files' own clock, for messages."""
+    return f"{time + sequence.time_offset:.6f}"
+
+
+def has_variation(depth: np.ndarray) -> bool:  # [H, W] m
+    """Return whether a depth image shows at least two depths."""
+    for part in (depth[::8, ::8], depth):  # a few pixels tell it nearly always
+        measured = part[part > 0]
+        if measured.size and measured.min() < measured.max():
+            return True
+    return False
 
 
 class WrappedSequence(EventDepthSequence):
@@ -107,6 +156,7 @@ class WrappedSequence(EventDepthSequence):
         self._sequence = sequence
         for name in inspect.get_annotations(EventDepthSequence):
             setattr(self, name, getattr(sequence, name))
+        self.notes = sequence.notes
 
     @property
     def time_range(self) -> tuple[float, float]:
@@ -126,6 +176,9 @@ class WrappedSequence(EventDepthSequence):
 
 
 MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface shows something
+ROUNDING = 0.02 + 1e-4  # of the longest interval: 20 Hz in whole milliseconds are at times 51 ms apart
+SAME_TIME = 1e-6  # s; float64 seconds since the epoch are multiples of 2.4e-7
+MANY_OUTSIDE = 0.1  # of the depth images: so many without events around them are worth a note
 
 
 class SampledSequence:
@@ -134,6 +187,8 @@ class SampledSequence:
     `start` counts from the first event or depth image, whichever is earlier, so that a recording cut out
     of a longer one needs no other numbers. A sample ends at every depth image; gaps longer than
     `max_interval` are divided evenly by samples without depth, unless there are no events to track then.
+    The first sample has depth: images that cannot be used are passed over until there is one. Later ones
+    leave their samples without depth.
     """
 
     def __init__(
@@ -148,11 +203,22 @@ class SampledSequence:
         stamps = sequence.depth_timestamps
         begin = min([first, *stamps[:1]]) + start
         end = np.inf if duration is None else begin + duration
-        inside = stamps[(stamps >= begin - 1e-9) & (stamps <= end + 1e-9)]
+        inside = stamps[(stamps >= begin - SAME_TIME) & (stamps <= end + SAME_TIME)]
         if sequence.has_events:  # depth outside their stream has nothing to be tracked with
-            inside = inside[(inside >= first + MIN_HISTORY) & (inside <= last + max_interval)]
+            wanted = len(inside)
+            inside = inside[inside >= first + MIN_HISTORY - SAME_TIME]
+            inside = inside[inside <= last + max_interval + SAME_TIME]
+            if wanted - len(inside) > MANY_OUTSIDE * wanted + 2:
+                sequence.note(
+                    f"{wanted - len(inside)} of {wanted} depth images are not within the events' time, "
+                    f"{stamp_text(sequence, first)} to {stamp_text(sequence, last)} s, and are left out"
+                )
+        while len(inside) > 1 and sequence.depth_or_none(int(np.searchsorted(stamps, inside[0]))) is None:
+            inside = inside[1:]
         if len(inside) < 2:
             depth_range = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else "nothing"
+            if sequence.notes:
+                depth_range += f" ({sequence.notes[-1]})"
             events_range = f"{first:.3f} to {last:.3f} s" if sequence.has_events else "nothing"
             raise DataError(
                 f"{sequence.scene}: expected at least 2 depth images between {begin:.3f} s and "
@@ -161,11 +227,11 @@ class SampledSequence:
             )
         times, has_depth = [float(inside[0])], [True]
         for a, b in itertools.pairwise(inside):
-            pieces = int(np.ceil((b - a) / max_interval - 1e-6)) if sequence.has_events else 1
+            pieces = int(np.ceil((b - a) / max_interval - ROUNDING)) if sequence.has_events else 1
             times += [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
             has_depth += [False] * (pieces - 1) + [True]
         self.timestamps = np.array(times)  # [S]
-        self.has_depth = np.array(has_depth)  # [S] bool
+        self.has_depth = np.array(has_depth)  # [S] bool: there is an image, which may turn out to be useless
         self._depth_index = np.searchsorted(stamps, self.timestamps, side="left")
 
     def __len__(self) -> int:
@@ -188,7 +254,7 @@ class SampledSequence:
         return Sample(
             timestamp=t,
             events=Events.empty(),
-            depth=self.sequence.depth(int(self._depth_index[k])) if self.has_depth[k] else None,
+            depth=self.sequence.depth_or_none(int(self._depth_index[k])) if self.has_depth[k] else None,
             image=self.sequence.image_at(t),
             T_world_camera=self.sequence.true_pose(t),
         )

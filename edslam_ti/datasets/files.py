@@ -1,38 +1,28 @@
-"""Reading the small files around an event stream: number tables, images, depth images, numbered names."""
+"""Reading the small files around an event stream: lists of times, images, numbered names."""
 
+import os
 import re
-import warnings
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from edslam_ti.camera import Camera
-from edslam_ti.errors import DataError
+from edslam_ti.camera import LARGEST_SIDE, Camera
+from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
+from edslam_ti.tables import LARGEST, read_table, text_lines
 
-FARTHEST_DEPTH = 1e4  # m; renderers write 1e10 or 65504 (half-precision maximum) where they hit nothing
+LARGEST_NUMBER = 10**16  # in a file name: microseconds since 1970 are 2e15
+LARGEST_IMAGE = 1_000_000_000  # bytes of a file
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+STDERR = 2  # file descriptor
 
 
 def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, columns] float64
     """Return the table in a text file of `columns` numbers a line; `line` describes one in messages."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; expected lines '{line}'")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an empty file is refused below
-            rows = np.loadtxt(path, comments="#", ndmin=2)
-    except (ValueError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise DataError(f"{path}: expected {columns} numbers a line '{line}'; {reason}") from error
-    if rows.size == 0:
-        raise DataError(f"{path}: expected lines '{line}', got an empty file")
-    if rows.shape[1] != columns:
-        raise DataError(f"{path}: expected {columns} numbers a line '{line}', got {rows.shape[1]}")
-    finite = np.isfinite(rows).all(1)
-    if not finite.all():
-        bad = int(finite.argmin())
-        raise DataError(f"{path}: row {bad + 1} of the table holds a value that is not finite: {rows[bad]}")
-    return rows
+    return read_table(path, columns, line).rows
 
 
 def read_timed_paths(path: Path, use: str = "seconds") -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
@@ -40,25 +30,50 @@ def read_timed_paths(path: Path, use: str = "seconds") -> tuple[np.ndarray, list
 
     `use` says in a message what the lines are for.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; expected lines 't path', {use}")
     times: list[float] = []
     files: list[Path] = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
+    for number, text in text_lines(path, f"expected lines 't path', {use}"):
+        fields = text.split()
         try:
             time, name = float(fields[0]), fields[1]
         except (ValueError, IndexError) as error:
-            raise DataError(f"{path}: line {number}: expected 't path', got '{line}'") from error
-        if not np.isfinite(time) or (times and time <= times[-1]):
-            raise DataError(f"{path}: line {number}: expected increasing times in seconds, got {time}")
+            raise DataError(f"{path}: line {number}: expected 't path', got '{plain(text, 60)}'") from error
+        if not np.isfinite(time) or abs(time) > LARGEST or (times and time <= times[-1]):
+            raise DataError(
+                f"{path}: line {number}: expected increasing times in seconds, got {plain(fields[0], 40)}"
+                f"{f' after {times[-1]:.9f}' if times else ''}"
+            )
         times.append(time)
         files.append(path.parent / name)
     if not files:
         raise DataError(f"{path}: expected lines 't path', got an empty file")
     return np.array(times), files
+
+
+def read_timestamps(path: Path, files: dict[int, Path]) -> np.ndarray:  # [I] s
+    """Return the times of numbered files from a list of lines 'number_or_name seconds'."""
+    expected = "expected lines 'number_or_name seconds'"
+    keys = {key: number for number, f in files.items() for key in (f.name, f.stem, str(number))}
+    times: dict[int, float] = {}
+    for line, text in text_lines(path, expected):
+        *name, seconds = text.split(maxsplit=1)
+        try:
+            time = float(seconds)
+        except ValueError:
+            time = np.nan
+        if not name or not abs(time) <= LARGEST:
+            raise DataError(f"{path}: line {line}: {expected}, got '{plain(text, 60)}'")
+        number = keys.get(name[0])
+        if number is None and name[0].isdecimal() and int(name[0][:20]) in files:
+            number = int(name[0][:20])  # 000012 for 12
+        if number in times:
+            raise DataError(f"{path}: line {line}: a second time for {plain(name[0], 60)}; keep one")
+        if number is not None:  # lines may tell of images that are not there
+            times[number] = time
+    missing = [f.name for number, f in files.items() if number not in times]
+    if missing:
+        raise DataError(f"{path}: {expected}, got none for {missing[0]} ({len(missing)} such files)")
+    return np.array([times[number] for number in files])
 
 
 def numbered_files(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
@@ -73,6 +88,8 @@ def numbered_files(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dic
         if not numbers:
             raise DataError(f"{path}: expected a number in the file name, as in frame000100{path.suffix}")
         key = int(numbers[-1])
+        if key > LARGEST_NUMBER:
+            raise DataError(f"{path}: expected a time or an index in the file name, got {plain(key, 30)}")
         if key in found:
             raise DataError(f"{folder}: {found[key].name} and {path.name} both carry number {key}; keep one")
         found[key] = path
@@ -81,77 +98,93 @@ def numbered_files(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dic
 
 def read_image(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32 in [0, 1]
     """Return an image file as grey values of the camera's size."""
-    image = _decode(path, cv2.IMREAD_GRAYSCALE)
-    _check_size(path, image, camera, "image")
+    image = decode(path, cv2.IMREAD_GRAYSCALE, camera, "image")
     return image.astype(np.float32) / 255
-
-
-def read_depth(path: Path, camera: Camera, metres_per_unit: float) -> np.ndarray:  # [H, W] float32, m
-    """Return a depth image: PNG of 16 bits in `metres_per_unit`, or EXR in metres; 0 = missing.
-
-    EXR values of 10 km and more are what renderers write for "nothing hit" and become 0.
-    """
-    if path.suffix.lower() == ".exr":
-        depth = _decode_exr(path)
-        _check_size(path, depth, camera, "depth")
-        bad = ~np.isfinite(depth) | (depth < 0)
-        if bad.any():
-            v, u = np.argwhere(bad)[0]
-            raise DataError(
-                f"{path}: expected finite depth in metres, 0 where there is none, got {depth[v, u]} at "
-                f"column {u}, row {v} ({int(bad.sum())} such pixels)"
-            )
-        return np.where(depth >= FARTHEST_DEPTH, np.float32(0), depth)
-    depth = _decode(path, cv2.IMREAD_UNCHANGED)
-    if depth.dtype != np.uint16 or depth.ndim != 2:
-        raise DataError(
-            f"{path}: expected a 16-bit single-channel depth PNG, got {depth.dtype} of shape {depth.shape}"
-        )
-    _check_size(path, depth, camera, "depth")
-    return depth.astype(np.float32) * np.float32(metres_per_unit)
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image file."""
-    height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    height, width = decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
     return width, height
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: image not found")
+def first_image_size(paths: list[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image that can be read; raise what the first raises if none can."""
+    problem: DataError | OSError | None = None
+    for path in paths:
+        try:
+            return image_size(path)
+        except (DataError, OSError) as error:
+            problem = problem or error
+    raise problem or DataError("expected image files, got none")
+
+
+def decode(path: Path, flags: int, camera: Camera | None = None, what: str = "image") -> np.ndarray:
+    """Return the pixels of an image file as OpenCV decodes them, of the size of `camera` if it is given.
+
+    Bytes are read here, because OpenCV takes only names in UTF-8. What a PNG says of its size is compared
+    first: a few bytes may promise gigabytes.
+    """
+    data = file_bytes(path, what)
+    if data[:8] == PNG_SIGNATURE and len(data) >= 24:
+        width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
+        check_size(path, (height, width), camera, what)
+        if max(width, height) > LARGEST_SIDE:
+            raise DataError(
+                f"{path}: {what}: expected at most {LARGEST_SIDE} pixels a side, got {width}x{height}"
+            )
     try:
-        image = cv2.imread(str(path), flags)
-    except cv2.error as error:
+        with quiet():
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except (cv2.error, MemoryError) as error:
         raise DataError(f"{path}: not readable as an image ({' '.join(str(error).split())})") from error
     if image is None:
-        raise DataError(f"{path}: not readable as an image; truncated or not a {path.suffix[1:]} file?")
+        kind = path.suffix[1:] or "PNG"
+        raise DataError(f"{path}: not readable as an image; truncated or not a {kind} file?")
+    check_size(path, image.shape, camera, what)
     return np.asarray(image)
 
 
-def _decode_exr(path: Path) -> np.ndarray:  # [H, W] float32
-    """Return the depth channel of an OpenEXR file (OpenCV's wheels no longer read the format)."""
-    import OpenEXR
-
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: depth image not found")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
-    except (RuntimeError, ValueError) as error:
-        raise DataError(f"{path}: not readable as OpenEXR ({' '.join(str(error).split())})") from error
-    for wanted in ("Z", "V", "Y", "R"):  # R: renderers that repeat depth in R, G and B
-        for name, pixels in channels.items():
-            if name.split(".")[-1] == wanted:
-                return pixels
-    if len(channels) == 1:
-        return next(iter(channels.values()))
-    raise DataError(f"{path}: expected a channel Z, V, Y or R with depth, got {', '.join(sorted(channels))}")
-
-
-def _check_size(path: Path, image: np.ndarray, camera: Camera, what: str) -> None:
-    if image.shape[:2] != camera.shape:
+def check_size(path: Path, shape: tuple[int, ...], camera: Camera | None, what: str) -> None:
+    """Refuse an image of another size than the camera's."""
+    if camera is not None and tuple(shape[:2]) != camera.shape:
         raise DataError(
             f"{path}: {what}: expected the camera's {camera.width}x{camera.height} pixels, got "
-            f"{image.shape[1]}x{image.shape[0]}; state the true camera in camera.json or resize"
+            f"{shape[1]}x{shape[0]}; state the true camera in camera.json or resize"
         )
+
+
+def file_bytes(path: Path, what: str) -> bytes:
+    """Return what is in a file of at most `LARGEST_IMAGE` bytes; devices and pipes are no files."""
+    if not path.is_file():
+        raise FileNotFoundError(plain(f"{path}: {what} not found", LONGEST_MESSAGE))
+    try:
+        if path.stat().st_size > LARGEST_IMAGE:
+            raise DataError(f"{path}: {what}: expected at most {LARGEST_IMAGE} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {what} cannot be read ({error.strerror})") from error
+
+
+_stderr_lock = threading.Lock()
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep off stderr what C libraries print of a damaged file; the error that is raised says it."""
+    with _stderr_lock:
+        try:
+            saved = os.dup(STDERR)
+        except OSError:  # closed: nothing can be printed
+            saved = None
+        if saved is None:
+            yield
+            return
+        try:
+            sink = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(sink, STDERR)
+            os.close(sink)
+            yield
+        finally:
+            os.dup2(saved, STDERR)
+            os.close(saved)

@@ -17,10 +17,9 @@ Replica as NICE-SLAM rendered it (Zhu et al. 2022):
     [frames/]frame-NNNNNN.depth.png, .color.{png,jpg}, .pose.txt      16 bits, 1/1000 m; T_world_camera
     camera-intrinsics.txt  3x3 matrix K; may also lie in the folder above
 
-Poses and images are optional, depth is not. Depth of 65535 is "no measurement" in 7-Scenes and the end of
-the scale elsewhere: missing. A `camera.json` as in event_replica.py may state the camera (all of width,
-height, fx, fy, cx, cy; pixel centres at integers unless it says "half"), `depth_scale` and `frame_rate`
-(default 30 Hz, where files have numbers and no times).
+Poses and images are optional, depth is not. A `camera.json` (camera_file.py) may state the camera (all of
+width, height, fx, fy, cx, cy; pixel centres at integers unless it says "half"), `depth_scale`, `invalid` and
+`frame_rate` (default 30 Hz, where files have numbers and no times).
 
 TUM states no camera in its folders: `freiburg1`, 2 or 3 in the folder's name gives the published one, and
 images and depth are undistorted with it. Its depth and colour are not taken at the same moment: each depth
@@ -28,7 +27,6 @@ image gets the nearest colour image within `MAX_DIFFERENCE`, each colour image s
 taken at the time of the depth.
 """
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,22 +37,23 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence
-from edslam_ti.datasets.event_replica import LATEST_START, CameraFile, check_rigid, read_camera
+from edslam_ti.datasets.camera_file import CameraFile, read_camera, read_json
+from edslam_ti.datasets.clocks import check_clock, clock_offset
+from edslam_ti.datasets.depth import DepthFormat, look_at_images, read_depth
 from edslam_ti.datasets.files import (
-    image_size,
+    first_image_size,
     numbered_files,
-    read_depth,
     read_image,
     read_numbers,
     read_timed_paths,
 )
-from edslam_ti.errors import DataError
+from edslam_ti.datasets.truth import MATRIX, check_rigid, read_poses
+from edslam_ti.errors import DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.geometry import orthonormalized
 from edslam_ti.trajectory import Trajectory, read_tum
 
 MAX_DIFFERENCE = 0.02  # s between depth and its colour image (associate.py of the TUM benchmark)
-NO_MEASUREMENT = 65535  # PNG value
 TUM_SCALE, MILLIMETRES = 5000.0, 1000.0  # PNG units in a metre
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # Of the TUM benchmark's page: fx, fy, cx, cy of 640x480 pixels, then distortion k1, k2, p1, p2, k3.
@@ -70,12 +69,13 @@ class _Recording:
     """What a layout's files say."""
 
     camera: Camera
-    metres_per_unit: float
+    depth_format: DepthFormat
     depth_files: list[Path]
     depth_times: np.ndarray  # [D] s, strictly increasing
     image_files: list[Path]
     image_times: np.ndarray  # [I] s, strictly increasing
     truth: Trajectory | None
+    notes: tuple[str, ...] = ()  # what was mended in the files
     distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 of images and depth; none: undistorted
 
 
@@ -95,20 +95,20 @@ class RgbdSequence(EventDepthSequence):
             expected = " or ".join(f"{layout.files} ({name})" for name, layout in LAYOUTS.items())
             raise DataError(f"{folder}: no depth found; expected {expected}")
         recording = LAYOUTS[layout].read(folder)
-        self.camera, self.description = recording.camera, f"{layout} layout, {folder}, no events"
+        self.camera, self.description = recording.camera, f"{layout} layout, {plain(folder)}, no events"
         self._depth_files, self._image_files = recording.depth_files, recording.image_files
-        self._metres_per_unit = recording.metres_per_unit
-        first = float(recording.depth_times[0])
-        self.time_offset = first if abs(first) > LATEST_START else 0.0
+        self._depth_format = recording.depth_format
+        self.time_offset = clock_offset(float(recording.depth_times[0]))
         self.depth_timestamps = recording.depth_times - self.time_offset
         self.image_timestamps = recording.image_times - self.time_offset
+        for text in recording.notes:
+            self.note(text)
         self.truth = None
         if recording.truth is not None:
             self.truth = Trajectory(recording.truth.timestamps - self.time_offset, recording.truth.poses)
+            check_clock(self, folder, "the file of poses", self.truth.timestamps)
         self._maps = _undistortion(self.camera, recording.distortion)
-        self.depth(0)  # a wrong size or format shows now, not in the middle of a run
-        if self._image_files:
-            self.image(0)
+        look_at_images(self, folder)  # what is wrong shows now, not in the middle of a run
 
     @property
     def time_range(self) -> tuple[float, float]:
@@ -118,8 +118,7 @@ class RgbdSequence(EventDepthSequence):
         return Events.empty()
 
     def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
-        depth = read_depth(self._depth_files[index], self.camera, self._metres_per_unit)
-        depth[depth == np.float32(NO_MEASUREMENT) * np.float32(self._metres_per_unit)] = 0
+        depth = read_depth(self._depth_files[index], self.camera, self._depth_format)
         if self._maps is None:
             return depth
         return np.asarray(cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST))
@@ -166,15 +165,18 @@ def _read_tum(folder: Path) -> _Recording:
     distortion: tuple[float, ...] = ()
     if camera is None:
         camera, distortion = _freiburg_camera(folder)
-    has_truth = (folder / "groundtruth.txt").is_file()
+    notes: list[str] = []
+    truth_file = folder / "groundtruth.txt"
+    truth = read_tum(truth_file, notes) if truth_file.is_file() else None
     return _Recording(
         camera,
-        _metres_per_unit(stated, TUM_SCALE),
+        stated.depth_format(TUM_SCALE),
         depth_files,
         depth_times,
         [image_files[k] for k in partners.values()],
         depth_times[list(partners)],
-        read_tum(folder / "groundtruth.txt") if has_truth else None,
+        truth,
+        tuple(notes),
         distortion,
     )
 
@@ -221,10 +223,10 @@ def _is_replica(folder: Path) -> bool:
 def _read_replica(folder: Path) -> _Recording:
     results = folder / "results"
     stated = read_camera(folder / "camera.json")
-    camera, metres_per_unit = _stated_camera(folder, stated), stated.metres_per_unit
+    camera, depth_format = _stated_camera(folder, stated), stated.depth_format()
     if camera is None or "depth_scale" not in stated.model_fields_set:
         published, units_per_metre = _replica_camera(folder)
-        camera, metres_per_unit = camera or published, _metres_per_unit(stated, units_per_metre)
+        camera, depth_format = camera or published, stated.depth_format(units_per_metre)
     depth = numbered_files(results, "depth*", (".png",))
     images = _numbered(results, "frame*", (".jpg", ".jpeg", ".png"))
     truth = None
@@ -238,7 +240,7 @@ def _read_replica(folder: Path) -> _Recording:
         truth = Trajectory(np.arange(len(poses)) / stated.frame_rate, poses)
     return _Recording(
         camera,
-        metres_per_unit,
+        depth_format,
         *_with_times(depth, stated),
         *_with_times(images, stated),
         truth,
@@ -254,15 +256,17 @@ def _replica_camera(folder: Path) -> tuple[Camera, float]:
             f"{places[1]} not found; expected NICE-SLAM's cam_params.json there or in the sequence's folder"
         )
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))["camera"]
+        values = read_json(path)["camera"]
         w, h, fx, fy, cx, cy, scale = (float(values[k]) for k in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        size = round(w), round(h)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f'{path}: expected {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}; {type(error).__name__}: {error}'
+            f'{path}: expected {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}; {type(error).__name__}: '
+            f"{plain(error)}"
         ) from error
-    if not scale > 0:
-        raise DataError(f"{path}: scale: expected depth units in a metre, got {scale}")
-    return Camera(round(w), round(h), fx, fy, cx, cy), scale
+    if not 1e-6 <= scale <= 1e6:
+        raise DataError(f"{path}: scale: expected depth units in a metre, 1e-6 to 1e6, got {scale:g}")
+    return Camera(*size, fx, fy, cx, cy), scale
 
 
 # --- 7-Scenes and 3DMatch ---
@@ -281,7 +285,7 @@ def _read_frames(folder: Path) -> _Recording:
     stated = read_camera(folder / "camera.json")
     depth = numbered_files(frames, "*.depth*", (".png",))
     images = _numbered(frames, "*.color*", (".png", ".jpg", ".jpeg"))
-    camera = _stated_camera(folder, stated) or _matrix_camera(folder, next(iter(depth.values())))
+    camera = _stated_camera(folder, stated) or _matrix_camera(folder, list(depth.values()))
     truth = None
     pose_files = numbered_files(frames, "*.pose*", (".txt",))
     if pose_files:
@@ -289,15 +293,15 @@ def _read_frames(folder: Path) -> _Recording:
         truth = Trajectory(np.array(list(pose_files)) / stated.frame_rate, poses)
     return _Recording(
         camera,
-        _metres_per_unit(stated, MILLIMETRES),
+        stated.depth_format(MILLIMETRES),
         *_with_times(depth, stated),
         *_with_times(images, stated),
         truth,
     )
 
 
-def _matrix_camera(folder: Path, image: Path) -> Camera:
-    """Return the camera of camera-intrinsics.txt, of the size of an image."""
+def _matrix_camera(folder: Path, images: list[Path]) -> Camera:
+    """Return the camera of camera-intrinsics.txt, of the size of the images."""
     places = [parent / "camera-intrinsics.txt" for parent in (folder, folder.resolve().parent)]
     path = next((p for p in places if p.is_file()), None)
     if path is None:
@@ -312,7 +316,7 @@ def _matrix_camera(folder: Path, image: Path) -> Camera:
             f"{path}: expected fx 0 cx, 0 fy cy, 0 0 1, got "
             f"{np.array2string(K.ravel(), max_line_width=10**6)}"
         )
-    return Camera(*image_size(image), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    return Camera(*first_image_size(images), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 # --- all layouts ---
@@ -330,11 +334,6 @@ def _stated_camera(folder: Path, stated: CameraFile) -> Camera | None:
     return Camera(*(getattr(stated, name) for name in INTRINSICS))
 
 
-def _metres_per_unit(stated: CameraFile, units_per_metre: float) -> float:
-    is_stated = "depth_scale" in stated.model_fields_set
-    return stated.metres_per_unit if is_stated else 1 / units_per_metre
-
-
 def _numbered(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Return the files of a pattern by their number; there need not be any."""
     return numbered_files(folder, pattern, suffixes) if any(folder.glob(pattern)) else {}
@@ -347,12 +346,13 @@ def _with_times(files: dict[int, Path], stated: CameraFile) -> tuple[list[Path],
 
 def _poses(path: Path) -> np.ndarray:  # [F, 4, 4]
     """Return the poses of a file: 16 numbers a line, or one matrix in 4 lines of 4."""
-    columns = 16 if path.name == "traj.txt" else 4
-    rows = read_numbers(path, columns, "the 4x4 matrix T_world_camera, row by row")
-    if rows.size % 16:
-        raise DataError(f"{path}: expected a 4x4 matrix T_world_camera, got {len(rows)} rows of {columns}")
+    if path.name == "traj.txt":
+        return read_poses(path)[0]
+    rows = read_numbers(path, 4, MATRIX)
+    if len(rows) != 4:
+        raise DataError(f"{path}: expected a 4x4 matrix T_world_camera, got {len(rows)} rows of 4")
     poses = rows.reshape(-1, 4, 4)
-    check_rigid(poses, path)
+    check_rigid(poses, path, np.array([1]))
     return np.array([orthonormalized(T) for T in poses])
 
 

@@ -25,22 +25,25 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.datasets.camera_file import read_camera
+from edslam_ti.datasets.clocks import check_clock, clock_offset, note_coverage
+from edslam_ti.datasets.depth import look_at_images, read_depth
 from edslam_ti.datasets.event_file import EventFile
-from edslam_ti.datasets.event_replica import LATEST_START, read_camera
 from edslam_ti.datasets.files import (
-    image_size,
+    first_image_size,
     numbered_files,
-    read_depth,
     read_image,
     read_numbers,
     read_timed_paths,
 )
-from edslam_ti.errors import DataError
+from edslam_ti.errors import DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory, read_tum
 
 EVENTS_AT_ONCE = 1_000_000  # undistorting takes some 70 bytes an event, its result 13
 TUM_DEPTH_SCALE = 5000.0  # PNG units in a metre
+LARGEST_DISTORTION = 1000  # coefficients of real lenses are below 10
+LEAST_SEEN = 0.1  # share of the undistorted image
 
 
 class RpgSequence(EventDepthSequence):
@@ -53,42 +56,48 @@ class RpgSequence(EventDepthSequence):
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
-        K = read_numbers(folder / "calib.txt", 9, "fx fy cx cy k1 k2 p1 p2 k3")[0]
+        K = _calibration(folder / "calib.txt")
         image_times, image_files = read_timed_paths(folder / "images.txt", "which also give depth its times")
         depth, depth_folder = _depth_files(folder, len(image_times))
-        width, height = image_size(image_files[0]) if image_files else image_size(next(iter(depth.values())))
-        self.camera = Camera(width, height, *(float(v) for v in K[:4]))
+        width, height = first_image_size(image_files or list(depth.values()))
+        try:
+            self.camera = Camera(width, height, *(float(v) for v in K[:4]))
+        except DataError as error:
+            raise DataError(f"{folder / 'calib.txt'}: {error}") from error
         self._distortion = K[4:]
         self._depth_files = list(depth.values())
         self._image_files = image_files
         measured = "measured" if depth_folder == "depth" else "derived from the true poses, not measured"
-        self.description = f"RPG Event Camera Dataset layout, {folder}, undistorted; depth {measured}"
-
-        stated = read_camera(folder / "camera.json")
-        scale_is_given = "depth_scale" in stated.model_fields_set
-        self._metres_per_unit = stated.metres_per_unit if scale_is_given else 1 / TUM_DEPTH_SCALE
+        self.description = f"RPG Event Camera Dataset layout, {plain(folder)}, undistorted; depth {measured}"
+        self._depth_format = read_camera(folder / "camera.json").depth_format(TUM_DEPTH_SCALE)
 
         self._events = EventFile(folder / "events.txt", width, height, is_text=True)
         self.num_dropped_events = self._events.num_dropped
-        first, _ = self._events.time_range
-        self.time_offset = first if abs(first) > LATEST_START else 0.0
+        self.time_offset = clock_offset(self._events.time_range[0])
         if self.time_offset:
             self._events = self._events.shifted(self.time_offset)
         self.image_timestamps = image_times - self.time_offset
         self.depth_timestamps = image_times[list(depth)] - self.time_offset
+        check_clock(self, folder, "images.txt", self.image_timestamps)
+        note_coverage(self)
         self.truth = None
         if (folder / "groundtruth.txt").exists():
-            truth = read_tum(folder / "groundtruth.txt")
+            truth = read_tum(folder / "groundtruth.txt", self.notes)
             self.truth = Trajectory(truth.timestamps - self.time_offset, truth.poses)
+            check_clock(self, folder, "groundtruth.txt", self.truth.timestamps)
 
         matrix = self.camera.matrix
         self._image_maps = cv2.initUndistortRectifyMap(
             matrix, self._distortion, np.eye(3), matrix, (width, height), cv2.CV_32FC1
         )
         self._undistortion = _EventUndistortion(*self._image_maps)
-        self.depth(0)
-        if image_files:
-            self.image(0)
+        if self._undistortion.share_seen < LEAST_SEEN:
+            raise DataError(
+                f"{folder / 'calib.txt'}: expected distortion k1 k2 p1 p2 k3 of a lens, got one that shows "
+                f"{100 * self._undistortion.share_seen:.0f} % of the undistorted image: "
+                f"{' '.join(f'{v:g}' for v in self._distortion)}"
+            )
+        look_at_images(self, folder)
 
     @property
     def time_range(self) -> tuple[float, float]:
@@ -98,7 +107,7 @@ class RpgSequence(EventDepthSequence):
         return self._undistortion(self._events.between(start, end))
 
     def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
-        return read_depth(self._depth_files[index], self.camera, self._metres_per_unit)
+        return read_depth(self._depth_files[index], self.camera, self._depth_format)
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
         raw = read_image(self._image_files[index], self.camera)
@@ -120,6 +129,7 @@ class _EventUndistortion:
         height, self._width = u.shape
         x, y = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
         is_seen = ((x >= 0) & (x < self._width) & (y >= 0) & (y < height)).ravel()
+        self.share_seen = float(is_seen.mean())  # of the undistorted pixels
         source = (y * self._width + x).ravel()
         order = np.argsort(source, kind="stable")
         self._targets = order[is_seen[order]]  # undistorted pixels, sorted by the sensor's pixel
@@ -137,6 +147,18 @@ class _EventUndistortion:
         rank = np.arange(len(event)) - np.repeat(np.cumsum(number) - number, number)
         y, x = np.divmod(self._targets[first[event] + rank], self._width)
         return Events(x.astype(np.int16), y.astype(np.int16), events.t[event], events.polarity[event])
+
+
+def _calibration(path: Path) -> np.ndarray:  # [9] fx fy cx cy k1 k2 p1 p2 k3
+    rows = read_numbers(path, 9, "fx fy cx cy k1 k2 p1 p2 k3")
+    if len(rows) > 1:
+        raise DataError(f"{path}: expected one line of 9 numbers, got {len(rows)}; keep this camera's")
+    if np.abs(rows[0, 4:]).max() > LARGEST_DISTORTION:
+        raise DataError(
+            f"{path}: expected distortion k1 k2 p1 p2 k3 within +-{LARGEST_DISTORTION}, got "
+            f"{' '.join(f'{v:g}' for v in rows[0, 4:])}"
+        )
+    return np.asarray(rows[0])
 
 
 def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:

@@ -15,6 +15,7 @@ from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.ray_casting import RayCaster, pixel_rays
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_poses_at
 
 NUM_SAMPLES = 100_000  # points drawn on a reconstructed mesh
 SPACING = 0.02  # metres; one true point is kept of those that fall into a cube of this size
@@ -93,10 +94,11 @@ def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -
             f"{sequence.scene}: expected surfaces.ply and true poses to compare a mesh with; simulated "
             "recordings have both"
         )
-    inside = [t for t in estimate.timestamps if sequence.truth.covers(t)]
-    if not inside:
+    poses, is_known = true_poses_at(sequence.truth, estimate.timestamps)
+    inside = estimate.timestamps[is_known]
+    if len(inside) == 0:
         raise DataError(f"{sequence.scene}: the estimate has no pose at a time that the truth covers")
-    truth = sequence.truth.resampled(np.array(inside))
+    truth = Trajectory(inside, poses[is_known])
     novel = [v.T_world_camera for v in sequence.novel_views() if inside[0] <= v.timestamp <= inside[-1]]
     surfaces = TrueSurfaces(sequence.surfaces_file)
     seen = seen_points(surfaces.views(sequence.camera, [*viewpoints(truth), *novel]))

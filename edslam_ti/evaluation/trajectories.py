@@ -11,16 +11,20 @@ import numpy as np
 from edslam_ti.errors import DataError
 from edslam_ti.geometry import orthonormalized
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import FARTHEST, true_path, true_poses_at
 
-LONGEST_TRUTH_GAP = 0.5  # s: motion capture drops out; truth is not interpolated over longer gaps
+FEWEST_POSES = 3  # that an alignment needs
+UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}  # of time stamps, in a second
+ACROSS_A_HOLE = 1.5  # times the usual step between the poses compared
 
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Errors of an estimated path against the truth at its own times (Eq. 9 between the truth's stamps).
+    """Errors of an estimated path against the truth at its own times, where `true_poses_at` knows it.
 
     ATE: distance of positions after Umeyama alignment of all poses, with rotation and translation (SE(3)) or
-    scale too (Sim(3)). RPE: error of the motion between consecutive poses, of the path without scaling.
+    scale too (Sim(3)). RPE: error of the motion between consecutive poses, of the path without scaling; pairs
+    with a hole of the truth between them are left out.
     """
 
     timestamps: np.ndarray  # [P] s, the poses compared
@@ -30,13 +34,19 @@ class TrajectoryErrors:
     true_positions: np.ndarray  # [P, 3] m
     errors_cm: np.ndarray  # [P] SE(3)
     errors_sim3_cm: np.ndarray  # [P]
-    motion_errors_cm: np.ndarray  # [P - 1] RPE, translation
-    motion_errors_deg: np.ndarray  # [P - 1] RPE, rotation angle
+    motion_errors_cm: np.ndarray  # [P - 1 or fewer] RPE, translation
+    motion_errors_deg: np.ndarray  # [P - 1 or fewer] RPE, rotation angle
     scale: float  # by which Sim(3) alignment multiplies the estimate
+    num_estimated: int  # poses of the estimate, compared or not
 
     @property
     def num_poses(self) -> int:
         return len(self.timestamps)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the estimate's poses that were compared."""
+        return self.num_poses / self.num_estimated
 
     @property
     def ate_rmse_cm(self) -> float:
@@ -70,19 +80,20 @@ class TrajectoryErrors:
 
 
 def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
-    """Compare the poses of an estimate whose times the truth covers with the truth at those times."""
+    """Compare the poses of an estimate at whose times the truth is known with the truth there.
+
+    Raises `DataError` with one line when there are fewer than three, or positions that are no metres.
+    """
     from evo.core.metrics import APE, RPE, PoseRelation
     from evo.core.trajectory import PosePath3D
 
-    common = _common_times(estimate, truth)
-    if common.sum() < 3:
-        raise DataError(
-            f"trajectory: expected at least 3 poses at times that the truth covers, got {common.sum()} of "
-            f"{len(estimate)} ({_span(estimate)}; truth {_span(truth)}); are both in seconds, on one clock?"
-        )
+    _check_positions(estimate, truth)
+    poses, common = true_poses_at(truth, estimate.timestamps)
+    if common.sum() < FEWEST_POSES:
+        raise DataError(_too_few(estimate, truth, int(common.sum())))
     timestamps = estimate.timestamps[common]
     estimated = np.array([orthonormalized(T) for T in estimate.poses[common]])
-    true = truth.resampled(timestamps).poses
+    true = poses[common]
     reference = PosePath3D(poses_se3=list(true))
     aligned, errors, rigid = [], [], np.eye(4)
     for with_scale in (False, True):
@@ -101,27 +112,30 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
         rpe = RPE(relation)  # over one frame
         rpe.process_data((reference, PosePath3D(poses_se3=list(estimated))))
         motion[relation] = np.asarray(rpe.error)
+    indices = np.flatnonzero(common)
+    steps = np.diff(indices)
+    is_step = steps <= ACROSS_A_HOLE * np.median(steps)
     return TrajectoryErrors(
         timestamps=timestamps,
-        indices=np.flatnonzero(common),
+        indices=indices,
         T_truth_estimate=rigid,
         aligned_positions=aligned[0],
         true_positions=true[:, :3, 3],
         errors_cm=errors[0],
         errors_sim3_cm=errors[1],
-        motion_errors_cm=100 * motion[PoseRelation.translation_part],
-        motion_errors_deg=motion[PoseRelation.rotation_angle_deg],
+        motion_errors_cm=100 * motion[PoseRelation.translation_part][is_step],
+        motion_errors_deg=motion[PoseRelation.rotation_angle_deg][is_step],
         scale=scale,
+        num_estimated=len(estimate),
     )
 
 
 def ate_rmse_cm(estimate: Trajectory, truth: Trajectory, with_scale: bool = False) -> float | None:
     """Return the ATE of `TrajectoryErrors` alone, 20 times as fast; None below three common poses."""
-    common = _common_times(estimate, truth)
-    if common.sum() < 3:
+    poses, common = true_poses_at(truth, estimate.timestamps)
+    if common.sum() < FEWEST_POSES:
         return None
-    estimated = estimate.poses[common]
-    true = truth.resampled(estimate.timestamps[common]).poses
+    estimated, true = estimate.poses[common], poses[common]
     R, t, scale = align(estimated, true, with_scale)
     distances = np.linalg.norm(scale * estimated[:, :3, 3] @ R.T + t - true[:, :3, 3], axis=1)
     return 100 * _rms(distances)
@@ -191,21 +205,44 @@ def statistics(errors: np.ndarray) -> dict[str, float]:
     }
 
 
-def _common_times(estimate: Trajectory, truth: Trajectory) -> np.ndarray:  # [F] bool
-    """Return which poses of the estimate lie inside the truth and not in a gap of it."""
-    stamps, times = truth.timestamps, estimate.timestamps
-    if len(stamps) < 2 or len(times) == 0:
-        return np.isin(times, stamps)
-    steps = np.diff(stamps)
-    k = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(steps) - 1)
-    at_a_stamp = np.minimum(np.abs(times - stamps[k]), np.abs(times - stamps[k + 1])) < 1e-6
-    inside = (times >= stamps[0]) & (times <= stamps[-1])
-    return at_a_stamp | (inside & (steps[k] <= max(LONGEST_TRUTH_GAP, 3 * float(np.median(steps)))))
+def _check_positions(estimate: Trajectory, truth: Trajectory) -> None:
+    """Refuse positions that are no metres; of the truth, a few such poses are left out instead."""
+    for name, path, allowed in (("estimate", estimate, 0.0), ("truth", truth, 0.5)):
+        far = ~(np.abs(path.poses[:, :3, 3]) <= FARTHEST).all(1)
+        if far.sum() > allowed * len(path):
+            k = int(far.argmax())
+            x, y, z = path.poses[k, :3, 3]
+            raise DataError(
+                f"trajectory: {name}: expected positions in metres, got {x:.6g}, {y:.6g}, {z:.6g} at "
+                f"{path.timestamps[k]:.9g} s (pose {k + 1}, and {int(far.sum()) - 1} more such poses)"
+            )
 
 
-def _span(trajectory: Trajectory) -> str:
-    t = trajectory.timestamps
-    return f"{t[0]:.6g} to {t[-1]:.6g} s" if len(t) else "empty"
+def _too_few(estimate: Trajectory, truth: Trajectory, num_common: int) -> str:
+    """Return the line that says why two paths cannot be compared."""
+    times, stamps = estimate.timestamps, truth.timestamps
+    line = (
+        f"trajectory: expected at least {FEWEST_POSES} poses at times that the truth covers, got "
+        f"{num_common} of {len(estimate)} ({_span(times)}; truth {_span(stamps)}); are both in seconds, on "
+        "one clock?"
+    )
+    if len(times) < 2 or len(stamps) < 2:
+        return line
+    for unit, factor in UNITS.items():
+        for name, odd, other in (("truth", stamps, times), ("estimate", times, stamps)):
+            ratio = np.ptp(odd) / factor / np.ptp(other)
+            meets = odd[0] / factor <= other[-1] and odd[-1] / factor >= other[0]
+            if 0.1 < ratio < 30 and (meets or 0.7 < ratio < 1.5):
+                return f"{line} The {name} looks as if in {unit}"
+    if stamps[0] > times[-1] or times[0] > stamps[-1]:
+        return f"{line} They begin {abs(stamps[0] - times[0]):.9g} s apart"
+    inside = int(((stamps >= times[0]) & (stamps <= times[-1])).sum())
+    step = true_path(truth).median_step
+    return f"{line} The truth has {inside} poses in that time (one in {step:.3g} s)"
+
+
+def _span(times: np.ndarray) -> str:
+    return f"{times[0]:.9g} to {times[-1]:.9g} s" if len(times) else "empty"
 
 
 def _rms(values: np.ndarray) -> float:

@@ -92,7 +92,8 @@ def contrast_from_images(
     for gap in GAPS:
         pairs = [(a, b) for a, b in zip(inside, inside[gap:]) if stamps[b] - stamps[a] <= LONGEST_PAIR]
         step = max(1, len(pairs) // MAX_PAIRS)
-        products += [_products(sequence, int(a), int(b)) for a, b in pairs[::step][:MAX_PAIRS]]
+        compared = (_products(sequence, int(a), int(b)) for a, b in pairs[::step][:MAX_PAIRS])
+        products += [p for p in compared if p is not None]
     if len(products) < 2 or np.sum([p.events for p in products], 0).min() < MIN_EVENTS:
         return None
     M, v = (
@@ -118,8 +119,11 @@ class _Products:
     events: np.ndarray  # [2] positive and negative ones
 
 
-def _products(sequence: EventDepthSequence, first: int, second: int) -> _Products:
-    before, after = sequence.image(first), sequence.image(second)
+def _products(sequence: EventDepthSequence, first: int, second: int) -> _Products | None:
+    """Return the sums of a pair of images, None where one of them cannot be read."""
+    before, after = sequence.image_or_none(first), sequence.image_or_none(second)
+    if before is None or after is None:
+        return None
     start, end = (float(sequence.image_timestamps[k]) for k in (first, second))
     regressors = _regressors(sequence.events(start - HISTORY, end), start, before.shape)
     square = (cv2.boxFilter(r, -1, (RING, RING), normalize=False) for r in regressors)

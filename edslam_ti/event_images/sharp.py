@@ -62,7 +62,9 @@ class SharpImages:
         taken = self._taken_in(frame)
         if taken is None:
             return None
-        image, time = self._sequence.image(taken), float(self._sequence.image_timestamps[taken])
+        image, time = self._sequence.image_or_none(taken), float(self._sequence.image_timestamps[taken])
+        if image is None:
+            return None
         clipped = (image >= BRIGHTEST).astype(np.int8) - (image <= DARKEST)
         log_image = np.log(image + self._epsilon) + self._correction(time, frame.timestamp, image.shape)
         return SharpImage(log_image.astype(np.float32), clipped)

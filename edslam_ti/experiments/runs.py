@@ -26,6 +26,7 @@ from edslam_ti.output import atomic_file
 from edslam_ti.pipeline import contrast_of, make_slam
 from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_poses_at
 
 Report = Callable[[str, float], None]  # what goes on, and the share of it that is done
 Value = TypeVar("Value")
@@ -110,9 +111,8 @@ def _errors(slam: Slam, sequence: EventDepthSequence, depth_times: np.ndarray) -
 def _drift_cm(estimate: Trajectory, sequence: EventDepthSequence) -> np.ndarray:  # [F]
     """Return the distance from the truth when both start at the same pose."""
     assert sequence.truth is not None
-    covered = [sequence.truth.covers(t) for t in estimate.timestamps]
-    poses = estimate.poses[covered]
-    truth = sequence.truth.resampled(estimate.timestamps[covered]).poses
+    true, is_known = true_poses_at(sequence.truth, estimate.timestamps)
+    poses, truth = estimate.poses[is_known], true[is_known]
     moved = truth[0] @ np.linalg.inv(poses[0]) @ poses
     distances: np.ndarray = 100 * np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=1)
     return distances

@@ -12,15 +12,15 @@ import numpy as np
 from rich.console import Console
 
 from edslam_ti.depth_images import without_depth_edges
-from edslam_ti.errors import DataError
 from edslam_ti.evaluation.images import LinearFit
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.output import atomic_folder
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_of
-from edslam_ti.results.pictures import NoEncoderError, fly_through_frames, smooth_path, write_video
+from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
 from edslam_ti.results.run import Run
+from edslam_ti.results.trust import Trust
 from edslam_ti.results.views import save_views
 from edslam_ti.trajectory import write_tum
 
@@ -36,26 +36,43 @@ def save(run: Run, console: Console) -> Path:
     parent = config.out / run.sequence.dataset / run.sequence.scene / config.method
     folder = _unused(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
     started = time.perf_counter()
-    truth = run.true_trajectory()
+    truth, trust = run.true_trajectory(), Trust.of(slam)
     slice_s = slice_of(run, truth)
     with console.status("saving"), atomic_folder(folder) as partial:
-        write_tum(slam.trajectory, partial / "trajectory_tum.txt")
-        write_tum(slam.frontend_trajectory, partial / "trajectory_frontend_tum.txt")
+        offset = run.sequence.time_offset  # files carry the recording's own stamps
+        write_tum(slam.trajectory, partial / "trajectory_tum.txt", offset)
+        write_tum(slam.frontend_trajectory, partial / "trajectory_frontend_tum.txt", offset)
         if truth is not None:
-            write_tum(truth, partial / "truth_tum.txt")
-        plot_trajectory(partial / "trajectory.png", {config.method: slam.trajectory}, truth)
+            write_tum(truth, partial / "truth_tum.txt", offset)
+        run.attempt("poses.csv", lambda: trust.write(partial / "poses.csv", offset), otherwise=None)
         (partial / "config.yaml").write_text(config.to_yaml())
+        _write_log(run, partial)
         views = save_views(run, truth, slice_s, partial / "renders")
         mesh = _save_map(run, views["held out"].fit, partial)
-        metrics = run_metrics(run, truth, slice_s, views, mesh)
+        metrics = run_metrics(run, truth, slice_s, views, mesh, trust)
+        _draw_trajectory(run, trust, partial / "trajectory.png")
         metrics |= cost_metrics(run, saving_seconds=time.perf_counter() - started)
         (partial / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        for line in (*metrics["truth_notes"], *metrics["problems"]):
+            run.note(line)
         run.note("seconds per frame: " + _listed(metrics["seconds_per_frame"]))
         run.note("saved")
-        (partial / "log.txt").write_text("\n".join(run.messages) + "\n")
+        _write_log(run, partial)
     _point_latest_to(folder)
-    _print_summary(metrics, console)
+    _print_summary(metrics, run.left_out, console)
     return folder
+
+
+def _write_log(run: Run, folder: Path) -> None:
+    (folder / "log.txt").write_text("\n".join(run.messages) + "\n")
+
+
+def _draw_trajectory(run: Run, trust: Trust, path: Path) -> None:
+    estimates = {run.config.method: run.slam.trajectory}
+    sigmas = trust.sigmas[0] if trust.is_measured else None
+    run.attempt(
+        path.name, lambda: plot_trajectory(path, estimates, run.sequence.truth, sigmas), otherwise=None
+    )
 
 
 # --- the map ---
@@ -70,8 +87,9 @@ def _save_map(run: Run, fit: LinearFit | None, folder: Path) -> Any | None:
     if len(points) == 0:
         run.note("the map is empty: no map.ply, points.ply, mesh.ply, flythrough.mp4")
         return None
-    mapper.save(folder)
-    write_points(folder / "points.ply", points, brightness)
+    run.attempt("map.ply", lambda: mapper.save(folder), otherwise=None)
+    points_file = folder / "points.ply"
+    run.attempt("points.ply", lambda: write_points(points_file, points, brightness), otherwise=None)
     mesh = _write_mesh(run, mapper, folder / "mesh.ply")
     _write_fly_through(run, mapper, fit, folder / "flythrough.mp4")
     return mesh
@@ -86,13 +104,12 @@ def _write_mesh(run: Run, mapper: Mapper, path: Path) -> Any | None:
             opaque = np.where(view.alpha > MESH_ALPHA, view.depth, 0)
             yield without_depth_edges(opaque), view.intensity, T
 
-    try:
+    def made() -> Any:
         mesh = fuse_mesh(views(), run.sequence.camera, MESH_VOXEL)
         write_mesh(path, mesh)
-    except DataError as error:  # a map too thin for a surface: the other results stand
-        run.note(str(error))
-        return None
-    return mesh
+        return mesh
+
+    return run.attempt(path.name, made, otherwise=None)  # a map too thin has no surface
 
 
 def _write_fly_through(run: Run, mapper: Mapper, fit: LinearFit | None, path: Path) -> None:
@@ -103,10 +120,8 @@ def _write_fly_through(run: Run, mapper: Mapper, fit: LinearFit | None, path: Pa
             view = mapper.render(run.sequence.camera, T)
             yield view.intensity if fit is None else fit(view.intensity), view.depth
 
-    try:
-        write_video(path, fly_through_frames(views()), VIDEO_FPS)
-    except NoEncoderError as error:  # the other results stand
-        run.note(str(error))
+    frames = fly_through_frames(views())
+    run.attempt(path.name, lambda: write_video(path, frames, VIDEO_FPS), otherwise=None)
 
 
 # --- the folder ---
@@ -132,16 +147,28 @@ def _listed(values: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
-def _print_summary(metrics: Metrics, console: Console) -> None:
+def _print_summary(metrics: Metrics, left_out: list[str], console: Console) -> None:
     def show(name: str, unit: str) -> str:
         value = metrics.get(name)
         return "-" if value is None else f"{value:.2f} {unit}"
 
+    scale, coverage = metrics["ate_scale_sim3"], metrics["truth_coverage"]
+    of_scale = "" if scale is None else f" (Sim(3) {show('ate_rmse_sim3_cm', 'cm')}, scale {scale:.4f})"
+    of_truth = of_sigma = ""
+    if metrics["sigma_position_end_cm"] is not None:
+        of_sigma = (
+            f"sigma {show('sigma_position_median_cm', 'cm')} (end {show('sigma_position_end_cm', 'cm')}), "
+        )
+    if coverage is not None:
+        of_truth = f"{metrics['num_truth_poses_compared']} compared with truth ({100 * coverage:.0f} %), "
     console.print(
-        f"ATE {show('ate_rmse_cm', 'cm')}  RPE {show('rpe_trans_cm', 'cm')}, {show('rpe_rot_deg', 'deg')}  "
+        f"ATE {show('ate_rmse_cm', 'cm')}{of_scale}  RPE {show('rpe_trans_cm', 'cm')}, "
+        f"{show('rpe_rot_deg', 'deg')}  "
         f"PSNR {show('psnr_corrected_db', 'dB')} corrected, {show('psnr_db', 'dB')} raw  "
         f"depth L1 {show('depth_l1_cm', 'cm')}\n"
-        f"{metrics['num_frames']} frames, {metrics['num_lost_frames']} lost, "
+        f"{metrics['num_frames']} frames, {metrics['num_lost_frames']} lost, {of_sigma}{of_truth}"
         f"{metrics['num_gaussians']} Gaussians, tracking {show('tracking_hz', 'Hz')}, "
         f"{metrics['wall_s']:.0f} s in all, {metrics['peak_memory_mb']:.0f} MB"
     )
+    for line in (*metrics["data_notes"], *metrics["problems"], *metrics["truth_notes"], *left_out):
+        console.print(line, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 
 from edslam_ti import __version__
+from edslam_ti.errors import DataError
 from edslam_ti.evaluation.meshes import mesh_errors
 from edslam_ti.evaluation.trajectories import ate_rmse_cm, inceventgs_slice, trajectory_errors
+from edslam_ti.evaluation.truth_notes import truth_notes
 from edslam_ti.results.run import Run
+from edslam_ti.results.trust import Trust
 from edslam_ti.results.views import ViewNumbers
 from edslam_ti.trajectory import Trajectory
 
@@ -81,6 +84,7 @@ def run_metrics(
     slice_s: tuple[float, float] | None,  # seconds, of `slice_of`
     views: dict[str, ViewNumbers],  # by kind
     mesh: Any | None,  # Open3D TriangleMesh, None: the run made none
+    trust: Trust,
 ) -> Metrics:
     """Return all metrics but those of `cost_metrics`."""
     config, sequence, slam = run.config, run.sequence, run.slam
@@ -93,6 +97,7 @@ def run_metrics(
         "description": sequence.description,
         "method": config.method,
         **measured,
+        "time_offset_s": sequence.time_offset,
         "num_frames": num_frames,
         "num_lost_frames": sum(not r.converged for r in slam.results),
         "num_keyframes": of_map.pop("num_keyframes", None),
@@ -101,6 +106,9 @@ def run_metrics(
         "num_mapping_steps": of_map.pop("num_mapping_steps", None),
         "num_hot_pixels": of_map.pop("num_hot_pixels", None),
         **of_map,
+        **trust.metrics(),
+        "num_dropped_events": sequence.num_dropped_events,
+        "data_notes": list(sequence.notes),
         "contrast_threshold": _rounded(run.contrast.value),
         "contrast_threshold_source": run.contrast.source,
         "contrast_threshold_positive": _rounded(run.contrast.positive),
@@ -143,18 +151,31 @@ def cost_metrics(run: Run, saving_seconds: float) -> Metrics:
 
 
 def trajectory_metrics(run: Run, truth: Trajectory | None) -> Metrics:
-    """Return the trajectory's errors and the length of the true path; None without (enough) truth.
+    """Return the trajectory's errors, the length of the true path and notes; None without (enough) truth.
 
+    Errors are counted between the truth's own stamps; `truth`, at the tracked times, shows no holes.
     `ate_frontend_rmse_cm` is of the poses as they were tracked, before the mapper corrected any.
     """
-    errors, frontend = None, None
-    if truth is not None and len(truth) >= 3:
-        errors = trajectory_errors(run.slam.trajectory, truth)
-        frontend = ate_rmse_cm(run.slam.frontend_trajectory, truth)
+    errors, frontend, notes = None, None, []
+    coverage = None
+    estimate, original = run.slam.trajectory, run.sequence.truth
+    if original is not None:
+        coverage = 0.0
+        try:
+            errors = trajectory_errors(estimate, original)
+            coverage = errors.coverage
+            frontend = ate_rmse_cm(run.slam.frontend_trajectory, original)
+            notes = truth_notes(estimate, original, errors, run.sequence.time_offset)
+        except DataError as error:
+            notes = [str(error)]
     return {
         **_named(errors, TRAJECTORY_METRICS),
         "ate_frontend_rmse_cm": _rounded(frontend),
         "path_length_m": _rounded(None if truth is None else truth.length()),
+        "ate_scale_sim3": None if errors is None else _rounded(errors.scale, 6),
+        "num_truth_poses_compared": 0 if errors is None else errors.num_poses,
+        "truth_coverage": _rounded(coverage),
+        "truth_notes": notes,
     }
 
 
@@ -175,7 +196,9 @@ def _mesh_metrics(run: Run, truth: Trajectory | None, mesh: Any | None) -> Metri
     """Return the mesh's errors against the true surfaces that the camera saw; None without them."""
     errors = None
     if mesh is not None and run.sequence.surfaces_file is not None and truth is not None:
-        errors = mesh_errors(mesh, run.sequence, run.slam.trajectory)
+        errors = run.attempt(
+            "mesh errors", lambda: mesh_errors(mesh, run.sequence, run.slam.trajectory), otherwise=None
+        )
     return _named(errors, MESH_METRICS)
 
 
@@ -225,7 +248,8 @@ def _inceventgs_protocol(
         start, end = slice_s or (-np.inf, np.inf)
         inside = (trajectory.timestamps >= start) & (trajectory.timestamps <= end)
         part = Trajectory(trajectory.timestamps[inside], trajectory.poses[inside])
-        ate = ate_rmse_cm(part, truth, with_scale=True)
+        assert run.sequence.truth is not None  # `truth` is it
+        ate = ate_rmse_cm(part, run.sequence.truth, with_scale=True)
     where = (
         f"their slice, {slice_s[0]:g} to {slice_s[1]:g} s" if slice_s else "whole run (no slice of theirs)"
     )
@@ -244,8 +268,8 @@ def _named(errors: object | None, fields: dict[str, str]) -> Metrics:
     }
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else round(float(value), 4)
+def _rounded(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None or not np.isfinite(value) else round(float(value), digits)
 
 
 def _peak_memory_mb() -> float:

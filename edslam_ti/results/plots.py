@@ -14,6 +14,7 @@ from edslam_ti.mapping.volume import MeshView
 from edslam_ti.results.pictures import new_figure, save_figure
 from edslam_ti.results.reading import Result, load_result
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_poses_at
 from edslam_ti.viewer import frustum_lines
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 START, END = "#009E73", "#D55E00"
 MAX_DRAWN_POINTS = 60_000
+HOLE = 1.5  # usual steps: the true path is not drawn across longer ones
 
 
 # ---------------------------------------------------------------- trajectories
@@ -60,22 +62,35 @@ def align_to_truth(estimate: Trajectory, truth: Trajectory | None) -> AlignedPat
     return AlignedPath(positions @ T[:3, :3].T + T[:3, 3], unknown)
 
 
-def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Trajectory | None) -> None:
+def plot_trajectory(
+    path: Path,
+    estimates: Mapping[str, Trajectory],
+    truth: Trajectory | None,
+    sigmas: np.ndarray | None = None,  # [F] metres, of the first estimate's positions
+) -> None:
     """Draw top and side views of estimates, aligned to the truth when there is one.
 
-    A single estimate is coloured by its position error; several by name.
+    A single estimate is coloured by its position error; several by name. Sigmas are drawn as a band over
+    time, with the error where the truth is known.
     """
     paths = {
         name: align_to_truth(estimate, truth) for name, estimate in estimates.items() if len(estimate) > 0
     }
     if not paths:
         raise DataError(f"{path.name}: expected at least one trajectory with poses, got none")
-    figure = new_figure(11, 5)
-    views = _top_and_side(next(e for e in estimates.values() if len(e)) if truth is None else truth)
-    axes = figure.subplots(1, 2)
+    figure = new_figure(11, 5) if sigmas is None else new_figure(11, 7)
+    first_estimate = next(e for e in estimates.values() if len(e))
+    true = None if truth is None else _known_at(truth, first_estimate.timestamps)
+    views = _top_and_side(true or first_estimate)
+    grid = figure.add_gridspec(
+        1 if sigmas is None else 2, 2, height_ratios=None if sigmas is None else (5, 2)
+    )
+    axes = [figure.add_subplot(grid[0, k]) for k in range(2)]
+    if sigmas is not None:
+        _draw_sigmas(figure.add_subplot(grid[1, :]), first_estimate, next(iter(paths.values())), sigmas)
     for ax, view in zip(axes, views):
-        if truth is not None and len(truth):
-            _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
+        if true is not None:
+            _draw_path(ax, _with_holes(true), view, color="black", label="truth", linewidth=1.2)
         only = next(iter(paths.values())) if len(paths) == 1 else None
         if only is not None and np.isfinite(only.errors).sum() >= 2:
             bar = _draw_errors(ax, only, view)
@@ -93,6 +108,32 @@ def plot_trajectory(path: Path, estimates: Mapping[str, Trajectory], truth: Traj
         + ("" if truth is None else " (rigidly aligned)")
     )
     save_figure(figure, path)
+
+
+def _draw_sigmas(ax: "Axes", estimate: Trajectory, aligned: AlignedPath, sigmas: np.ndarray) -> None:
+    """Draw twice the sigma of every position as a band over time, and the error where it is known."""
+    seconds = estimate.timestamps - estimate.timestamps[0]
+    ax.fill_between(seconds, 0, 200 * sigmas, color=COLOURS[5], alpha=0.4, linewidth=0, label="2 sigma")
+    if np.isfinite(aligned.errors).any():
+        ax.plot(seconds, 100 * aligned.errors, color=COLOURS[1], linewidth=1.2, label="position error")
+    ax.set(xlabel="seconds", ylabel="[cm]", xlim=(0, max(float(seconds[-1]), 1e-3)))
+    ax.set_ylim(bottom=0)
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, framealpha=0.8)
+
+
+def _known_at(truth: Trajectory, times: np.ndarray) -> Trajectory | None:
+    """Return the truth at those times at which it is known; None if there is none."""
+    poses, is_known = true_poses_at(truth, times)
+    return Trajectory(times[is_known], poses[is_known]) if is_known.any() else None
+
+
+def _with_holes(path: Trajectory) -> np.ndarray:  # [F + number of holes, 3]
+    """Return positions with a row of NaN in every hole, so that no line is drawn across it."""
+    steps = np.diff(path.timestamps)
+    is_hole = steps > HOLE * np.median(steps) if len(steps) else np.zeros(0, bool)
+    after = np.flatnonzero(is_hole) + 1
+    return np.insert(path.poses[:, :3, 3], after, np.nan, axis=0)
 
 
 @dataclass(frozen=True)
@@ -217,7 +258,7 @@ def draw_results(results: Sequence[Path], path: Path) -> None:
         ax = figure.add_subplot(grid[1, k])
         _draw_points(ax, runs, view)
         if truth is not None:
-            _draw_path(ax, truth.poses[:, :3, 3], view, color="black", label="truth", linewidth=1.2)
+            _draw_path(ax, _with_holes(truth), view, color="black", label="truth", linewidth=1.2)
         for run, color in zip(runs, colours()):
             _draw_path(ax, run.trajectory.poses[:, :3, 3], view, color=color, label=run.title, linewidth=2)
         _mark_ends(ax, runs[0].trajectory.poses[:, :3, 3], view)

@@ -1,15 +1,20 @@
 """What a run has produced."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-
-import numpy as np
+from typing import TypeVar
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
+from edslam_ti.truth import true_poses_at
+
+MOST_CHARACTERS = 300  # of a reason, whatever a library writes
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -27,18 +32,35 @@ class Run:
     is_interrupted: bool = False
     started: float = field(default_factory=time.perf_counter)
     messages: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)  # parts of the evaluation that failed, and why
 
     def note(self, message: str) -> None:
         """Add a line to the log, with the seconds since the start."""
         self.messages.append(f"{time.perf_counter() - self.started:8.2f} s  {message}")
 
+    def attempt(self, part: str, make: Callable[[], T], otherwise: T) -> T:
+        """Return what a part of the results is; where its data is at fault, note it and leave it out."""
+        try:
+            return make()
+        except (OSError, ValueError) as error:  # DataError is a ValueError
+            self.leave_out(part, error)
+            return otherwise
+
+    def leave_out(self, part: str, error: Exception) -> None:
+        """Note that a part of the results is missing, and why, once."""
+        reason = " ".join(str(error).split()) or type(error).__name__
+        line = f"{part} left out: {reason[:MOST_CHARACTERS]}"
+        if line not in self.left_out:
+            self.left_out.append(line)
+            self.note(line)
+
     def true_trajectory(self) -> Trajectory | None:
-        """Return the truth at those tracked times that it covers; None where there is none.
+        """Return the truth at those tracked times at which it is known; None where there is none.
 
         This interpolates the whole path: whoever saves a run asks once and passes the answer on.
         """
-        truth = self.sequence.truth
+        truth, times = self.sequence.truth, self.slam.trajectory.timestamps
         if truth is None:
             return None
-        times = [t for t in self.slam.trajectory.timestamps if truth.covers(t)]
-        return truth.resampled(np.array(times)) if times else None
+        poses, is_known = true_poses_at(truth, times)
+        return Trajectory(times[is_known], poses[is_known]) if is_known.any() else None

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +71,13 @@ def save_views(
     rows: list[PictureRow] = []
     table: list[dict[str, Any]] = []
     for kind in KINDS:  # one kind at a time: their images take memory
-        views = list(_rendered(run, kind, truth))
-        measured = _image_metrics(views, weights)
+        nothing: list[RenderedView] = []
+        views = run.attempt(f"{kind} views", partial(_all_rendered, run, kind, truth), otherwise=nothing)
+        measured = _image_metrics(run, views, weights)
         in_slice = None
         if slice_s is not None and kind == "held out":
-            in_slice = _image_metrics([v for v in views if slice_s[0] <= v.timestamp <= slice_s[1]], weights)
+            inside = [v for v in views if slice_s[0] <= v.timestamp <= slice_s[1]]
+            in_slice = _image_metrics(run, inside, weights)
         numbers[kind] = ViewNumbers(len(views), measured, _depth_l1_cm(views), in_slice)
         chosen = evenly_spaced(len(views), CONTACT_ROWS[kind])
         for k, view in enumerate(views):
@@ -93,6 +96,10 @@ def save_views(
 
 
 # --- rendering ---
+
+
+def _all_rendered(run: Run, kind: str, truth: Trajectory | None) -> list[RenderedView]:
+    return list(_rendered(run, kind, truth))
 
 
 def _rendered(run: Run, kind: str, truth: Trajectory | None) -> Iterator[RenderedView]:
@@ -142,12 +149,18 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 # --- numbers ---
 
 
-def _image_metrics(views: list[RenderedView], lpips_weights: Path | None) -> ImageMetrics | None:
+def _image_metrics(run: Run, views: list[RenderedView], lpips_weights: Path | None) -> ImageMetrics | None:
     truths = [v.image for v in views if v.image is not None]
     if not views or len(truths) < len(views):
         return None
     masks = [None if v.depth is None else v.depth > 0 for v in views]
-    return evaluate_images([v.view.intensity for v in views], truths, masks, lpips_weights)
+    images = [v.view.intensity for v in views]
+    if lpips_weights is not None:
+        try:
+            return evaluate_images(images, truths, masks, lpips_weights)
+        except (OSError, ValueError, RuntimeError) as error:  # of the file, or of torch when shapes differ
+            run.leave_out("LPIPS", error)
+    return evaluate_images(images, truths, masks)
 
 
 def _depth_l1_cm(views: list[RenderedView]) -> float | None:

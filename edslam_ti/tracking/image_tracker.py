@@ -14,7 +14,7 @@ A gap in the events leads from Tracking to Coasting, their return to Starting, a
 where an older keyframe recognises it (loop_closure.py), to Tracking.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.patch_warp import NormalEquations
+from edslam_ti.tracking.consistency import Consistency, ConsistencyCheck
 from edslam_ti.tracking.gaps import EventRate, bridge
 from edslam_ti.tracking.keyframes import (
     Aligned,
@@ -39,6 +40,7 @@ from edslam_ti.tracking.loop_closure import OldKeyframes
 from edslam_ti.tracking.patch_tracker import BidirectionalPatchTracker
 from edslam_ti.tracking.smoothing import PoseSmoother
 from edslam_ti.tracking.tracker import Attempt, TrackingResult, best_attempt
+from edslam_ti.tracking.uncertainty import measured
 from edslam_ti.trajectory import PathDraft, Trajectory
 
 
@@ -91,6 +93,8 @@ class BrightnessTracker:
         self._rate = EventRate(self._settings.silent_share, self._settings.slowing_share)
         self._usual_misfit = np.inf  # log brightness; until the first image is aligned, any is usual
         self._smoother = PoseSmoother()
+        self._check = ConsistencyCheck()
+        self._last_depth: np.ndarray | None = None  # [H, W] metres, as it came
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame` and corrections of earlier poses."""
@@ -110,6 +114,9 @@ class BrightnessTracker:
             best = self._follow(state.keyframe, newest, guess, path)
             result = best.result
             path.newest = result.T_world_camera
+            if result.converged:
+                self._compare(state.keyframe, newest, self._is_repeated(frame), path)
+            self._last_depth = frame.depth if frame.depth is not None else self._last_depth
             note = note or self._keep_up(state, newest, result.converged, best.overlap, path)
         else:
             if isinstance(state, Coasting):
@@ -125,7 +132,26 @@ class BrightnessTracker:
                 note = self._relocalise(keyframe, self._state.silent_since, path)
                 self._state = Tracking(keyframe)
         message = result.message or note
-        return TrackingResult(path.newest, result.converged, result.quality, message, path.corrections)
+        return replace(result, T_world_camera=path.newest, message=message, corrections=path.corrections)
+
+    def consistency(self, trajectory: Trajectory) -> Consistency | None:
+        """Return whether events and depth told the same motion; None: too little was compared."""
+        return self._check.result(trajectory)
+
+    def _is_repeated(self, frame: Frame) -> bool:
+        """Return whether a depth image is that of the frame before, to the last bit."""
+        last = self._last_depth
+        return frame.depth is not None and last is not None and np.array_equal(frame.depth, last)
+
+    def _compare(
+        self, keyframe: BrightnessKeyframe, newest: BrightnessFrame, is_repeated: bool, path: PathDraft
+    ) -> None:
+        """Measure the newest pose by brightness alone, too, to see whether depth says the same."""
+        if newest.depth is None or newest.index == keyframe.index or not self._check.wants():
+            return
+        by_brightness = self._aligned_without_depth(keyframe, newest, path)
+        if by_brightness is not None:
+            self._check.add(newest.index, keyframe.index, path.newest, *by_brightness, is_repeated)
 
     # --- without events ---
 
@@ -162,7 +188,9 @@ class BrightnessTracker:
         T, system = self._aligner.align_depth(old, newest.depth, inverse(T_world_old) @ guess)
         if system.num_depth < MIN_PIXELS:
             return TrackingResult(guess, False, 0.0, "too few events, and depth does not overlap")
-        return TrackingResult(T_world_old @ T, True, 0.5 * system.num_depth / system.num_usable)
+        measurement = measured(old.index, [system])
+        quality = 0.5 * system.num_depth / system.num_usable
+        return TrackingResult(T_world_old @ T, True, quality, measurement=measurement)
 
     # --- the first image of a segment ---
 
@@ -251,7 +279,9 @@ class BrightnessTracker:
         """Return the pose, or the guess and a reason where it cannot be trusted."""
         problem = aligned.problem(self._config)
         T = guess if problem else path.pose(keyframe.index) @ aligned.T_keyframe_camera
-        return TrackingResult(T, not problem, aligned.quality(self._config), problem)
+        measurement = None if problem else measured(keyframe.index, aligned.last)
+        quality = aligned.quality(self._config)
+        return TrackingResult(T, not problem, quality, problem, measurement=measurement)
 
     def _keep_up(
         self, state: Tracking, newest: BrightnessFrame, is_good: bool, overlap: float, path: PathDraft

@@ -11,7 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from edslam_ti.alignment import MIN_PIXELS, is_observed, levenberg_marquardt, linearised, residual_model
+from edslam_ti.alignment import (
+    MIN_PIXELS,
+    gauss_newton_step,
+    is_observed,
+    levenberg_marquardt,
+    linearised,
+    residual_model,
+)
 from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.config import TrackingConfig
 from edslam_ti.depth_images import downscaled, downscaled_depth
@@ -76,6 +83,7 @@ class Aligned:
     T_keyframe_camera: np.ndarray  # [4, 4]
     system: NormalEquations  # at full size
     misfit: float  # median absolute difference of log brightness
+    last: tuple[NormalEquations, ...]  # systems of the last step, one for each kind of residual
 
     @property
     def overlap(self) -> float:
@@ -212,6 +220,7 @@ class KeyframeAligner:
         for level, view in ((1, [downscaled(image), downscaled_depth(small)]), (0, [image, small])):
             linearise = linearised(keyframe.points[level], self._model, view, self._cameras[level])
             T, system = levenberg_marquardt(linearise, T, steps, SMALL_GAIN)
+        last: tuple[NormalEquations, ...] = (system,)
         if depth is not None and keyframe.depth_points is not None and self._model.depth_weight > 0:
             # Reduced depth is blurred at edges: the last step uses it as it was measured.
             nothing = np.zeros_like(depth.full)
@@ -219,12 +228,17 @@ class KeyframeAligner:
             geometry = linearised(
                 keyframe.depth_points, self._depth_only, [nothing, depth.full], self._camera
             )
-            both = brightness(T) + geometry(T)
-            T = T @ se3_exp(-np.linalg.solve(both.H, both.g))  # Gauss-Newton: the minimum is near
-        T = orthonormalized(T)
+            last = brightness(T), geometry(T)
+            both = last[0] + last[1]
+            step = gauss_newton_step(both)  # the minimum is near
+            if step is None:
+                system = both  # which says that motion is not observed
+            else:
+                T = T @ se3_exp(step)
+        T = orthonormalized(T) if np.isfinite(T).all() else start
         difference = self.difference(keyframe, image, T)
         misfit = float(np.median(np.abs(difference))) if len(difference) else np.inf
-        return Aligned(T, system, misfit)
+        return Aligned(T, system, misfit, last)
 
     def align_depth(
         self, keyframe: BrightnessKeyframe, depth: Depth, start: np.ndarray

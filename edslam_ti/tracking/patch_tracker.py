@@ -19,6 +19,7 @@ from edslam_ti.kernels.patch_warp import (
 )
 from edslam_ti.tracking.surfaces import SurfaceFrame, SurfaceFrameBuilder
 from edslam_ti.tracking.tracker import Attempt, TrackingResult, best_attempt
+from edslam_ti.tracking.uncertainty import measured
 from edslam_ti.trajectory import Trajectory
 
 
@@ -98,6 +99,9 @@ class BidirectionalPatchTracker:
             self._previous = current
         return best.result
 
+    def consistency(self, trajectory: Trajectory) -> None:
+        """Return nothing: time surfaces alone are too inexact to judge the data."""
+
     def refer_to(self, frame: Frame) -> None:
         """Align the next frames to this one, whose pose is on the trajectory, and forget earlier ones."""
         self._surfaces.reset()
@@ -105,11 +109,12 @@ class BidirectionalPatchTracker:
 
     def _track(self, current: _Reference, predicted: np.ndarray, trajectory: Trajectory) -> Attempt:
         def attempt(start: np.ndarray) -> Attempt:
-            return self._judge(self._align(current, start, trajectory), predicted)
+            reference = trajectory.index_of(self._references()[0].view.frame.timestamp)
+            return self._judge(self._align(current, start, trajectory), predicted, reference)
 
         return best_attempt(attempt, predicted, trajectory.pose(-1))
 
-    def _judge(self, alignment: _Alignment, predicted: np.ndarray) -> Attempt:
+    def _judge(self, alignment: _Alignment, predicted: np.ndarray, reference: int) -> Attempt:
         """Return the result and the overlap; a failed alignment falls back to the predicted pose."""
         system = alignment.system
         usable = max(system.num_usable, 1)
@@ -125,7 +130,9 @@ class BidirectionalPatchTracker:
             message = "motion not fully observed (ill-conditioned)"
         if message:
             return Attempt(TrackingResult(predicted, False, quality, message), False, overlap)
-        return Attempt(TrackingResult(alignment.T_world_camera, True, quality), True, overlap)
+        measurement = measured(reference, [system])
+        result = TrackingResult(alignment.T_world_camera, True, quality, measurement=measurement)
+        return Attempt(result, True, overlap)
 
     def _align(self, current: _Reference, guess: np.ndarray, trajectory: Trajectory) -> _Alignment:
         T = guess
@@ -133,7 +140,7 @@ class BidirectionalPatchTracker:
         for level in reversed(range(self._config.levels)):
             problem = self._problem(current, references, level)
             T, system = levenberg_marquardt(problem.linearise, T, self._config.iterations)
-        return _Alignment(orthonormalized(T), system)
+        return _Alignment(orthonormalized(T) if np.isfinite(T).all() else guess, system)
 
     def _references(self) -> list[_Reference]:
         assert self._keyframe is not None

@@ -7,7 +7,16 @@ from typing import Protocol
 import numpy as np
 
 from edslam_ti.frame import Frame
+from edslam_ti.tracking.consistency import Consistency
 from edslam_ti.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """How exactly a frame's pose was measured against another frame's."""
+
+    reference: int  # index of the frame that it was aligned to
+    covariance: np.ndarray  # [6, 6] of xi in T_reference_camera exp(xi); metres, radians
 
 
 @dataclass(frozen=True)
@@ -18,9 +27,9 @@ class TrackingResult:
     converged: bool
     quality: float  # fraction of patch pixels in agreement, 0 to 1
     message: str = ""  # why it failed, or what else is worth the log
-    corrections: Mapping[int, np.ndarray] = field(
-        default_factory=dict
-    )  # better poses [4, 4] of earlier frames
+    # Better poses T_world_camera [4, 4] of earlier frames, by index.
+    corrections: Mapping[int, np.ndarray] = field(default_factory=dict)
+    measurement: Measurement | None = None  # None: the pose is given or predicted, not measured
 
 
 @dataclass(frozen=True)
@@ -42,19 +51,31 @@ class Tracker(Protocol):
         What the frame says of earlier poses comes back as corrections: the trajectory is not changed here.
         """
 
+    def consistency(self, trajectory: Trajectory) -> Consistency | None:
+        """Return whether the data of a finished run told one motion; None: the tracker does not know."""
+
 
 class TruePoses:
     """A tracker that knows: `--poses truth`, for mapping alone."""
 
-    def __init__(self, true_pose: Callable[[float], np.ndarray | None]) -> None:
-        self._true_pose = true_pose
+    def __init__(
+        self,
+        true_pose: Callable[[float], np.ndarray | None],
+        likely_pose: Callable[[float], np.ndarray] | None = None,  # where there is no true one
+    ) -> None:
+        self._true_pose, self._likely_pose = true_pose, likely_pose
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the true pose."""
+        """Return the true pose; where it is not known, the frame is lost."""
         pose = self._true_pose(frame.timestamp)
-        if pose is None:
-            return TrackingResult(guess, False, 0.0, "no true pose at this time")
-        return TrackingResult(pose, True, 1.0)
+        if pose is not None:
+            return TrackingResult(pose, True, 1.0)
+        if self._likely_pose is not None:
+            guess = self._likely_pose(frame.timestamp)
+        return TrackingResult(guess, False, 0.0, "no true pose at this time")
+
+    def consistency(self, trajectory: Trajectory) -> None:
+        """Return nothing: true poses agree with themselves."""
 
 
 def best_attempt(

@@ -183,6 +183,7 @@ def test_sequence_without_images_at_its_depth_is_an_error(image_times: np.ndarra
         RgbdOdometryTracker(RgbdSequence(0.05 * np.arange(5), image_times))
 
 
+@pytest.mark.slow
 def test_real_kinect_motion_is_followed(shared_data: Path) -> None:
     folder = shared_data / "red_kitchen" / "frames"
     if not folder.is_dir():

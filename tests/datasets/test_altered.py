@@ -25,8 +25,12 @@ ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "events": (START + 0.1, START + 0.3),
     "image_at": (START + 0.1,),
     "true_pose": (START + 0.15,),
+    "depth_or_none": (2,),
+    "image_or_none": (1,),
+    "note": ("left out",),
 }
-DERIVED = {"image_at", "true_pose"}  # they follow from what the wrapper itself shows
+# They follow from what the wrapper itself shows.
+DERIVED = {"image_at", "true_pose", "depth_or_none", "image_or_none", "note"}
 
 
 class LoopSequence(EventDepthSequence):
@@ -47,7 +51,7 @@ class LoopSequence(EventDepthSequence):
         self._events = Events(zeros, zeros, t, np.ones(len(t), np.int8))
 
     def depth(self, index: int) -> np.ndarray:
-        return np.full(CAMERA.shape, index + 1, np.float32)
+        return np.arange(index + 1, index + 13, dtype=np.float32).reshape(CAMERA.shape)
 
     def image(self, index: int) -> np.ndarray:
         return np.full(CAMERA.shape, index / 10, np.float32)

@@ -1,6 +1,8 @@
 """EventReplica's layout: what is read, at what times, and what is refused in one line."""
 
 import json
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +55,8 @@ def test_without_camera_json_the_camera_is_event_replicas(tmp_path: Path) -> Non
     folder = write_sequence(tmp_path / "s")
     (folder / "camera.json").unlink()
     for path in [*folder.glob("depth/*"), *folder.glob("images/*")]:
-        cv2.imwrite(str(path), np.ones((480, 768), np.uint16 if "depth" in str(path) else np.uint8))
+        values = np.arange(480 * 768).reshape(480, 768)
+        cv2.imwrite(str(path), values.astype(np.uint16 if "depth" in str(path) else np.uint8))
     camera = EventReplicaSequence(folder).camera
     assert (camera.width, camera.height, *camera.intrinsics) == (768, 480, 384.0, 384.0, 383.5, 239.5)
 
@@ -88,21 +91,20 @@ def test_depth_exr_is_metres_and_far_values_are_missing(tmp_path: Path) -> None:
     for path in folder.glob("depth/*"):
         path.unlink()
     depth = np.full((HEIGHT, WIDTH), 2.5, np.float32)
-    depth[0, 0] = 1e10
+    depth[0, :6] = 1e10, np.nan, np.inf, -np.inf, -1, 3
     write_exr(folder / "Depth_exr/0100.exr", {"Z": depth})
-    half = np.minimum(depth, 65504).astype(np.float16)
+    half = depth.astype(np.float64)
+    half[0, 0] = 65504
+    half = half.astype(np.float16)
     write_exr(folder / "Depth_exr/0250.exr", dict.fromkeys("RGB", half))
     sequence = EventReplicaSequence(folder)
     assert sequence.depth_timestamps == pytest.approx([0.1, 0.25])
     for k in range(2):
         assert sequence.depth(k)[3, 3] == 2.5
-        assert sequence.depth(k)[0, 0] == 0
-    depth[2, 3] = np.nan
-    write_exr(folder / "Depth_exr/0100.exr", {"Z": depth})
-    with pytest.raises(DataError, match=r"0100\.exr: expected finite depth .* column 3, row 2"):
-        EventReplicaSequence(folder)
+        assert sequence.depth(k)[0, :6].tolist() == [0, 0, 0, 0, 0, 3]
     (folder / "Depth_exr/0100.exr").write_text("x")
-    with pytest.raises(DataError, match=r"0100\.exr: not readable as OpenEXR"):
+    (folder / "Depth_exr/0250.exr").write_text("x")
+    with pytest.raises(DataError, match=r"0100\.exr: not readable as OpenEXR .*2 of 2 depth images"):
         EventReplicaSequence(folder)
 
 
@@ -176,13 +178,16 @@ def test_large_absolute_stamps_are_shifted_together(tmp_path: Path) -> None:
         path.rename(path.with_name(f"frame{zero * 1000 + int(path.stem[5:])}.png"))
     np.savetxt(folder / "poses_ts.txt", zero + np.arange(13) * 0.025, fmt="%.3f")
     sequence = EventReplicaSequence(folder)
-    first = events[0, 2]
-    assert sequence.time_offset == first
-    assert sequence.time_range[0] == 0
-    assert sequence.depth_timestamps[1] == pytest.approx(zero + 0.05 - first, abs=1e-6)
+    assert sequence.time_offset == zero
+    assert sequence.time_range[0] == events[0, 2] - zero
+    assert sequence.depth_timestamps.tolist() == [0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3]  # to the last bit
     assert sequence.truth is not None
-    assert sequence.truth.timestamps[0] == pytest.approx(zero - first, abs=1e-6)
-    assert len(sequence.events(0.0, 0.1)) == int((events[:, 2] < first + 0.1).sum())
+    assert sequence.truth.timestamps == pytest.approx(np.arange(13) * 0.025, abs=3e-7)
+    assert len(sequence.events(0.0, 0.1)) == int((events[:, 2] < zero + 0.1).sum())
+    samples = SampledSequence(sequence, 0.0, None, 0.05)
+    assert len(samples) == len(
+        SampledSequence(EventReplicaSequence(write_sequence(tmp_path / "0")), 0, None, 0.05)
+    )
 
 
 def test_start_and_duration_count_from_the_first_stamp_of_a_cut_out(tmp_path: Path) -> None:
@@ -248,6 +253,27 @@ def _remove(pattern: str) -> Any:
     return change
 
 
+def _bytes(name: str, content: bytes) -> Any:
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def _each(name: str, image: np.ndarray | bytes) -> Any:
+    """Write one image over every image of a folder."""
+    data = image if isinstance(image, bytes) else cv2.imencode(".png", image)[1].tobytes()
+    return lambda folder: [path.write_bytes(data) for path in (folder / name).glob("*")]
+
+
+def png_header(width: int, height: int) -> bytes:
+    """Return the beginning of a grey PNG of 16 bits that promises a size, and an end."""
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)),
+        (b"IDAT", b""),
+        (b"IEND", b""),
+    )
+    parts = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
 EVENTS_FILE = "event_threshold_0.1/gray_events_data.npy"
 IDENTITY_LINE = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n"
 
@@ -273,40 +299,70 @@ REFUSED: dict[str, tuple[Any, str]] = {
         _events(lambda e: e.astype(np.int64)),
         r"expected times in seconds, which int64 cannot hold",
     ),
-    "other clock": (_events(lambda e: e + [0, 0, 500, 0]), r"events cover 500.* expected the same clock"),
+    "other clock": (
+        _events(lambda e: e + [0, 0, 500, 0]),
+        r"clocks differ: depth .* 0 to 0\.3 s, events 500",
+    ),
     "no event folder": (_remove(EVENTS_FILE), r"event file not found"),
     "no depth": (_remove("depth/*"), r"no depth found"),
     "depth of another size": (
-        lambda f: cv2.imwrite(str(f / "depth/frame000100.png"), np.ones((HEIGHT, WIDTH + 1), np.uint16)),
-        r"frame000100\.png: depth: expected the camera's 32x24 pixels, got 33x24",
+        _each("depth", np.ones((HEIGHT, WIDTH + 1), np.uint16)),
+        r"frame000000\.png: depth: expected the camera's 32x24 pixels, got 33x24.* \(7 of 7 depth images",
     ),
     "depth of 8 bits": (
-        lambda f: cv2.imwrite(str(f / "depth/frame000100.png"), np.ones((HEIGHT, WIDTH), np.uint8)),
-        r"frame000100\.png: expected a 16-bit single-channel depth PNG, got uint8",
+        _each("depth", np.ones((HEIGHT, WIDTH), np.uint8)),
+        r"frame000000\.png: expected a 16-bit single-channel depth PNG, got uint8",
     ),
-    "depth unreadable": (_write("depth/frame000100.png", "x"), r"frame000100\.png: not readable as an image"),
+    "depth of 3 channels": (
+        _each("depth", np.ones((HEIGHT, WIDTH, 3), np.uint16)),
+        r"frame000000\.png: expected a 16-bit single-channel depth PNG, got uint16 of shape \(24, 32, 3\)",
+    ),
+    "depth unreadable": (_each("depth", b"x"), r"frame000000\.png: not readable as an image"),
+    "depth saturated": (
+        _each("depth", np.full((HEIGHT, WIDTH), 65535, np.uint16)),
+        r"depth has no variation: every pixel is missing \(0 or the largest value\) in 7 of the 7",
+    ),
+    "no depth in depth": (_each("depth", np.zeros((HEIGHT, WIDTH), np.uint16)), r"depth has no variation"),
+    "depth constant": (
+        _each("depth", np.full((HEIGHT, WIDTH), 1234, np.uint16)),
+        r"depth has no variation: every pixel is missing or 1\.234 m in 7 of the 7 depth images looked at",
+    ),
+    "depth a bomb": (
+        _each("depth", png_header(60000, 60000)),
+        r"expected the camera's 32x24 pixels, got 6",
+    ),
     "depth unnamed": (_write("depth/frame.png", "x"), r"expected a number in the file name"),
+    "number in a name too large": (
+        lambda f: (f / "depth/frame000300.png").rename(f / f"depth/frame{'9' * 100}.png"),
+        r"png: expected a time or an index in the file name, got 9{26} \.\.\.",
+    ),
     "image of another size": (
-        lambda f: cv2.imwrite(str(f / "images/frame000100.png"), np.ones((HEIGHT + 1, WIDTH), np.uint8)),
-        r"frame000100\.png: image: expected the camera's 32x24 pixels, got 32x25",
+        _each("images", np.ones((HEIGHT + 1, WIDTH), np.uint8)),
+        r"frame000000\.png: image: expected the camera's 32x24 pixels, got 32x25",
     ),
     "poses without times": (_remove("poses_ts.txt"), r"traj\.txt is there but poses_ts\.txt is not"),
     "fewer poses than times": (_write("traj.txt", IDENTITY_LINE), r"got 13 times .* and 1 poses"),
     "empty poses": (_write("traj.txt", ""), r"traj\.txt: expected lines .* got an empty file"),
     "pose of 15 numbers": (_write("traj.txt", "1 " * 15), r"expected 16 numbers a line .* got 15"),
-    "pose not a number": (_write("traj.txt", "a " * 16), r"traj\.txt: expected 16 numbers a line"),
-    "pose nan": (_write("traj.txt", "nan " * 16), r"row 1 of the table holds a value that is not finite"),
+    "pose not a number": (
+        _write("traj.txt", "a " * 16),
+        r"traj\.txt: line 1: expected 16 numbers .*, got 'a'",
+    ),
+    "pose nan": (
+        _write("traj.txt", "nan " * 16),
+        r"traj\.txt: line 1: expected 16 .* finite .* got nan",
+    ),
     "pose not rigid": (
         _write("traj.txt", ("2" + IDENTITY_LINE[1:]) * 13),
         r"line 1: expected a rigid motion",
     ),
     "times not increasing": (
         _write("poses_ts.txt", "0\n" * 13),
-        r"expected increasing times, got 0\.0 then 0\.0",
+        r"poses_ts\.txt: line 4: a second pose for 0 s, 0\.075 m from that in line 1",
     ),
     "pose times in ms": (
         lambda f: np.savetxt(f / "poses_ts.txt", np.arange(13) * 25),
-        r"poses_ts\.txt \(s\) 0 to 300 s; expected the same clock",
+        r"poses_ts\.txt covers 0 to 300 s, events .* poses_ts\.txt looks as if it were in milliseconds",
     ),
     "calibration not JSON": (_write("camera.json", "{"), r"calibration not readable as JSON"),
     "calibration a list": (_write("camera.json", "[1]"), r"camera\.json: expected an object"),
@@ -316,7 +372,39 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "centres elsewhere": (_camera(pixel_centres="corner"), r"pixel_centres: .*'integer' or 'half'"),
     "misspelt key": (_camera(depth_scal=5000), r"unknown key 'depth_scal'; did you mean 'depth_scale'"),
     "distorted": (_camera(k1=-0.3), r"'k1': expected an undistorted camera"),
-    "centre outside": (_write("camera.json", '{"width": 32, "height": 24}'), r"principal point inside"),
+    "centre outside": (
+        _camera(cx=40.0),
+        r"camera\.json: expected the principal point inside the 32x24",
+    ),
+    "centre far outside": (
+        _write("camera.json", '{"width": 32, "height": 24}'),
+        r"principal point near",
+    ),
+    "focal length tiny": (
+        _camera(fx=1e-300),
+        r"camera\.json: camera: expected focal lengths in pixels, 0",
+    ),
+    "focal length huge": (_camera(fy=1e19), r"camera\.json: camera: expected focal lengths in pixels"),
+    "threshold tiny": (_camera(contrast_threshold=1e-300), r"contrast_threshold: .*greater than or equal"),
+    "scale huge": (_camera(depth_scale=1e300), r"depth_scale: .*less than or equal to 1000000"),
+    "width of 30 digits": (_camera(width=10**30), r"width: .*less than or equal to 32767, got 1000"),
+    "key twice": (_write("camera.json", '{"fx": 30, "fx": 31}'), r"the key 'fx' stands twice"),
+    "nested deeply": (
+        _write("camera.json", "[" * 100_000),
+        r"not readable as JSON: nested",
+    ),
+    "objects nested": (
+        _write("camera.json", '{"a":' * 50_000),
+        r"not readable as JSON: nested",
+    ),
+    "number of 1 MB": (
+        _write("camera.json", '{"fx": 1' + "0" * 1_000_000 + "}"),
+        r"not readable as JSON",
+    ),
+    "string of 1 MB": (_camera(width="9" * 1_000_000), r"camera\.json: width: .* got '999.*\.\.\.999"),
+    "not UTF-8": (_bytes("camera.json", b'{"description": "caf\xe9"}'), r"JSON: not in UTF-8"),
+    "distortion nested": (_camera(distortion=[[1], [2, 3]]), r"'distortion': expected an undistorted camera"),
+    "distortion a word": (_camera(k1="abc"), r"'k1': expected an undistorted camera"),
 }
 
 
@@ -327,4 +415,29 @@ def test_bad_data_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
     change(folder)
     with pytest.raises((DataError, FileNotFoundError), match=message) as caught:
         read_all(folder)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) <= 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("x" * 1_000_000, "x" * 196 + " ..."),
+        ("\x1b]0;title\x07", r"\x1b]0;title\x07"),
+        ("a\nb: c\r\n", r"a\nb: c\r\n"),
+        ("a\0b", r"a\x00b"),
+        ("\ud800", r"\ud800"),
+        ("[/nope] [bold]x", "[/nope] [bold]x"),
+        ("Büro, 2.5 m", "Büro, 2.5 m"),
+    ],
+)
+def test_a_description_is_one_short_line_of_text(tmp_path: Path, text: str, shown: str) -> None:
+    folder = write_sequence(tmp_path / "s", camera=CAMERA | {"description": text})
+    assert EventReplicaSequence(folder).description == shown
+
+
+def test_camera_json_may_begin_with_a_mark_and_hold_other_programs_keys(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "s")
+    values = CAMERA | {"k1": 0.0, "distortion": [0, 0], "serial": "x" * 100_000, "nested": {"a": [1]}}
+    (folder / "camera.json").write_text("\ufeff" + json.dumps(values), encoding="utf-8")
+    assert EventReplicaSequence(folder).camera.fx == 30

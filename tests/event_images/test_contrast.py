@@ -11,6 +11,7 @@ from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.event_images.contrast import contrast_from_images, contrast_threshold
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("positive", "negative"), [(0.1, None), (0.2, None), (0.35, None), (0.2, 0.26)])
 def test_threshold_is_found_within_ten_percent(
     tmp_path: Path, positive: float, negative: float | None

@@ -35,6 +35,8 @@ from edslam_ti.kernels.rasterization import rasterize
 from edslam_ti.kernels.reference import project
 from edslam_ti.mapping.gaussians import GaussianMap
 
+pytestmark = pytest.mark.slow
+
 OTHER = next((e for e in ENGINES if e != ENGINE and importlib.util.find_spec(e)), None)
 
 

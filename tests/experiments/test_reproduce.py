@@ -81,6 +81,7 @@ def test_altered_sequence_thins_depth_and_cuts_gaps(tiny_sequence: EventDepthSeq
     assert len(gap.events(0.15, 0.18)) == len(tiny_sequence.events(0.15, 0.18))
 
 
+@pytest.mark.slow
 def test_a_loop_is_played_again_where_it_ended(tmp_path: Path) -> None:
     settings = TINY.model_copy(update={"path": "loop", "duration": 0.2, "width": 48, "height": 32})
     room = tiny_room()
@@ -98,6 +99,7 @@ def test_a_loop_is_played_again_where_it_ended(tmp_path: Path) -> None:
     assert len(SampledSequence(twice, 0.0, None, 0.05)) == 2 * len(SampledSequence(once, 0.0, None, 0.05))
 
 
+@pytest.mark.slow
 def test_long_stream_reports_what_frames_cost(tiny_sequence: EventDepthSequence, tmp_path: Path) -> None:
     config = Config(duration=0.2, poses="truth").updated({"mapping": {"iterations": 1}})
     lines: list[str] = []
@@ -185,6 +187,7 @@ def tiny_case(scene: str, **differences: Any) -> Case:
     return replace(Case("rooms", Recording(scene)), **differences)
 
 
+@pytest.mark.slow
 def test_bench_records_failures_continues_and_is_resumed(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,6 +46,7 @@ def solved(prior: np.ndarray, seen: list[Observation], iterations: int, is_robus
     return solve_log_brightness_image(scene(), CAMERA, seen, prior, PRIOR_WEIGHT, iterations, is_robust)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_robust", [False, True])
 def test_image_is_that_of_the_twin(is_robust: bool) -> None:
     prior = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32)
@@ -62,6 +63,7 @@ def test_image_is_that_of_the_twin(is_robust: bool) -> None:
     np.testing.assert_allclose(solved(prior, seen, 200, is_robust), expected, atol=1e-3)  # single precision
 
 
+@pytest.mark.slow
 def test_equations_of_any_two_images_with_known_ones_among_them() -> None:
     """The image is solved twice, the second time robustly; hidden and unmeasured surfaces are left out."""
     prior = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32)
@@ -91,6 +93,7 @@ def test_equations_of_any_two_images_with_known_ones_among_them() -> None:
     np.testing.assert_array_equal(level[~is_observed], prior[~is_observed])
 
 
+@pytest.mark.slow
 def test_image_is_the_same_for_any_number_of_threads(device: str) -> None:
     prior, seen = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32), observations()
     images = []

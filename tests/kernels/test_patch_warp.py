@@ -77,6 +77,7 @@ def test_warp_and_sampling_match_the_twin() -> None:
     assert np.allclose(values[good], expected.numpy(), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_inverse", [False, True])
 def test_normal_equations_match_autograd_of_the_twin(is_inverse: bool) -> None:
     surface_a, depth_a = make_view(0)
@@ -109,6 +110,7 @@ def test_normal_equations_match_autograd_of_the_twin(is_inverse: bool) -> None:
     assert np.linalg.norm(ours.g - g.numpy()) / np.linalg.norm(g) < 5e-3
 
 
+@pytest.mark.slow
 def test_compositional_jacobians_match_autograd_of_the_template() -> None:
     v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float64)
     surface, depth = 0.5 + 0.25 * np.sin(u / 4) + 0.2 * np.cos(v / 3 - u / 9), 2 + 0.3 * np.sin(u / 15)
@@ -199,6 +201,7 @@ def test_directions_linearised_together_are_those_linearised_alone() -> None:
         assert (together[k].cost, together[k].num_usable) == (alone.cost, alone.num_usable)
 
 
+@pytest.mark.slow
 def test_normal_equations_have_the_same_bits_for_any_number_of_threads(device: str) -> None:
     T = make_motion(0.02)
     systems = []

@@ -33,6 +33,7 @@ def make_scene(
     return [x.to(dtype) for x in (means, quats, scales, opacities, colors, pose)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixelwise", [False, True])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_rendering_and_all_gradients_match_the_torch_twin(channels: int, pixelwise: bool) -> None:
@@ -63,6 +64,7 @@ def test_rendering_and_all_gradients_match_the_torch_twin(channels: int, pixelwi
         assert (a - b).norm() / b.norm() < 1e-4, name  # float32 against float64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixelwise", [False, True])
 @pytest.mark.usefixtures("double_precision")
 def test_gradcheck_in_double_precision(pixelwise: bool) -> None:
@@ -87,6 +89,7 @@ def test_gradcheck_in_double_precision(pixelwise: bool) -> None:
     assert check(render_from, (zero,))
 
 
+@pytest.mark.slow
 def test_a_gaussian_peaks_at_the_pixel_it_was_seeded_from() -> None:
     x, y, z = 12, 20, 2.0
     fx, fy, cx, cy = INTRINSICS
@@ -114,12 +117,14 @@ def gradients_with(inputs: list[torch.Tensor], **options: int | bool) -> list[to
     return [view.image.detach(), view.depth.detach(), *torch.autograd.grad(loss, inputs)]
 
 
+@pytest.mark.slow
 def test_repeated_runs_are_identical() -> None:
     inputs = [x.requires_grad_() for x in make_scene(300, seed=5)]
     for a, b in zip(gradients_with(inputs), gradients_with(inputs), strict=True):
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixelwise", [False, True])
 @pytest.mark.parametrize("tile", [4, 8, 64])
 def test_size_of_tiles_does_not_matter(tile: int, pixelwise: bool) -> None:
@@ -130,6 +135,7 @@ def test_size_of_tiles_does_not_matter(tile: int, pixelwise: bool) -> None:
         assert float((a - b).norm()) <= 1e-5 * float(b.norm())
 
 
+@pytest.mark.slow
 def test_number_of_threads_does_not_change_the_result(device: str) -> None:
     inputs = [x.requires_grad_() for x in make_scene(300, seed=6)]
 
@@ -144,6 +150,7 @@ def test_number_of_threads_does_not_change_the_result(device: str) -> None:
     assert all(torch.equal(a, b) for a, b in zip(one, two))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixelwise", [False, True])
 def test_gaussians_of_equal_depth_are_drawn_in_their_order(pixelwise: bool) -> None:
     means = torch.tensor([[0.0, 0, 2.0]] * 3)
@@ -160,6 +167,7 @@ def test_a_tile_that_cannot_be_cut_into_blocks_is_refused() -> None:
         rasterize(*make_scene(4, seed=8), INTRINSICS, SIZE, tile=18)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixelwise", [False, True])
 @pytest.mark.parametrize("count", [0, 4])
 def test_an_empty_view_is_black_and_has_zero_gradients(count: int, pixelwise: bool) -> None:

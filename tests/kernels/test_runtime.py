@@ -13,6 +13,8 @@ import torch
 from edslam_ti import kernels
 from edslam_ti.kernels.engine import ti
 
+pytestmark = pytest.mark.slow
+
 
 @ti.kernel
 def _read(values: ti.types.ndarray(ti.i32, ndim=1), place: ti.i32, out: ti.types.ndarray(ti.i32, ndim=1)):

@@ -121,6 +121,7 @@ def test_surfaces_by_polarity_need_polarities() -> None:
         update_last_timestamps(x, y, t, np.full(SHAPE, -np.inf), polarity)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 3])
 def test_any_number_of_threads_keeps_the_newest_event(device: str, threads: int) -> None:
     x, y, t, _ = make_events(MANY_EVENTS + 2, 6)

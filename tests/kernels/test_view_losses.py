@@ -79,6 +79,7 @@ def change(inputs: list[torch.Tensor], measured: torch.Tensor, scale: float, **o
     return compare_change(*inputs, INTRINSICS, SIZE, measured, BACKGROUND, EPSILON, scale, **options).loss
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixelwise", [False, True])
 def test_change_between_two_views_matches_rendering_them(pixelwise: bool) -> None:
     inputs, (measured, _) = [*make_map(300), make_poses()], images()
@@ -103,6 +104,7 @@ def test_one_view_with_depth_matches_rendering_it(pixelwise: bool) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("double_precision")
 def test_both_match_the_torch_twin_in_double_precision() -> None:
     inputs = [*make_map(100, torch.float64), make_poses(torch.float64)]
@@ -116,6 +118,7 @@ def test_both_match_the_torch_twin_in_double_precision() -> None:
     assert_same(with_gradients(view.loss, inputs), theirs, 1e-9)
 
 
+@pytest.mark.slow
 def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter(device: str) -> None:
     inputs, (measured, _) = [*make_map(300), make_poses()], images()
 
@@ -132,6 +135,7 @@ def test_repeated_runs_are_identical_and_tiles_and_threads_do_not_matter(device:
         kernels.init(device, threads=2)
 
 
+@pytest.mark.slow
 def test_a_view_of_nothing_has_zero_gradients() -> None:
     inputs, (target, depth) = [*make_map(20), make_poses()], images()
     behind = [(inputs[0].detach() - torch.tensor([0.0, 0.0, 10.0])).requires_grad_(), *inputs[1:]]

@@ -57,6 +57,7 @@ def corrected_psnr(camera: Camera, slam: Slam, samples: list[Sample], indices: l
 # --- what it achieves ---
 
 
+@pytest.mark.slow
 def test_mapping_raises_the_psnr_of_held_out_views(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
@@ -73,6 +74,7 @@ def test_mapping_raises_the_psnr_of_held_out_views(
     assert mapper.loss < 0.5
 
 
+@pytest.mark.slow
 def test_map_is_the_same_twice_to_the_last_bit(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
@@ -100,6 +102,7 @@ def test_depth_of_held_out_frames_is_never_used(
         assert (values == other.gaussians.raw[name]).all(), name
 
 
+@pytest.mark.slow
 def test_images_are_never_used(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
     samples = tiny_samples[:6]
     blind = [replace(s, image=None) for s in samples]
@@ -173,6 +176,7 @@ def test_map_of_a_few_gaussians_is_refined_like_any_other(
     assert np.isfinite(mapper.points()[1]).all()
 
 
+@pytest.mark.slow
 def test_map_follows_when_a_revisit_corrects_the_path(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,6 +256,7 @@ def test_without_budget_every_step_is_taken(
     assert mapper.budget.spent > 0
 
 
+@pytest.mark.slow
 def test_budget_leaves_out_steps_and_is_kept_to(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:

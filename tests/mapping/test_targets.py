@@ -98,6 +98,7 @@ def test_number_of_frames_is_bounded_and_keyframes_go_last(
     assert {1, 3, len(tiny_samples) - 1} <= set(images.frames)
 
 
+@pytest.mark.slow
 def test_unequal_thresholds_count_as_what_they_are(tmp_path: Path) -> None:
     folder = record_tiny_room(tmp_path / "room", contrast_threshold=0.2, negative_contrast_threshold=0.26)
     sequence = EventReplicaSequence(folder)

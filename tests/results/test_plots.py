@@ -16,6 +16,8 @@ from edslam_ti.results.plots import align_to_truth, draw_results, plot_trajector
 from edslam_ti.results.window import show_results
 from edslam_ti.trajectory import Trajectory, write_tum
 
+pytestmark = pytest.mark.slow
+
 VIEW_APP = Path(__file__).parents[2] / "apps" / "view.py"
 
 

@@ -17,6 +17,7 @@ def taichi_runs_already(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "init", lambda *arguments, **options: None)
 
 
+@pytest.mark.slow
 def test_a_built_in_scene_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["--scene", "wall", "--out", str(tmp_path / "wall"), "--depth-rate", "10", *SMALL])
     sequence = EventReplicaSequence(tmp_path / "wall")

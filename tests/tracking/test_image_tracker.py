@@ -46,6 +46,7 @@ def lost(slam: Slam) -> list[int]:
     return [k for k, result in enumerate(slam.results) if not result.converged]
 
 
+@pytest.mark.slow
 def test_brightness_images_are_better_than_time_surfaces_between_depth_images(
     sequence: EventDepthSequence, samples: list[Sample]
 ) -> None:

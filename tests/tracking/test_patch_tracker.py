@@ -39,6 +39,7 @@ def test_event_surfaces_alone_are_tracked_to_a_centimetre(
     assert ate_cm(slam, tiny_sequence) < 1.0  # 0.33 cm was measured
 
 
+@pytest.mark.slow
 def test_compositional_form_finds_nearly_the_same_poses(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
@@ -97,6 +98,7 @@ def test_depth_alone_carries_over_a_blackout_of_events(
     assert position_errors(slam, tiny_sequence).max() < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", ["absent", "all zero"])
 def test_frames_that_show_nothing_are_predicted_and_tracking_recovers(
     depth: str, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]

@@ -1,0 +1,128 @@
+"""Depth images as sensors and renderers write them: what is depth in them, and what means that there is none.
+
+PNG: 16 bits, one channel, in a stated unit. OpenEXR: metres, float or half, in a channel Z, V, Y or R.
+
+Missing are 0, negative values, NaN and infinity, the largest value of the type (65535 in PNG: "no
+measurement" or "beyond the range", 65504 in half floats), all from 10 km on (renderers write 1e10 where they
+hit nothing), and the value that camera.json states as `invalid`.
+"""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edslam_ti.camera import Camera
+from edslam_ti.datasets.base import EventDepthSequence, has_variation
+from edslam_ti.datasets.files import check_size, decode, file_bytes, quiet
+from edslam_ti.errors import DataError
+
+FARTHEST_DEPTH = 1e4  # m
+LOOKED_AT = 8  # depth images, and grey ones, that are read when a sequence is opened
+NEARLY_ALL = 0.8  # of them
+
+
+@dataclass(frozen=True)
+class DepthFormat:
+    """What the numbers in depth images mean."""
+
+    metres_per_unit: float  # PNG
+    invalid: float | None = None  # in the file's own units: stands for no measurement, too
+
+
+def read_depth(path: Path, camera: Camera, format: DepthFormat) -> np.ndarray:  # [H, W] float32, m
+    """Return a depth image in metres, 0 = missing.
+
+    Raises `FileNotFoundError`, and `DataError` for what is no depth image of the camera's size.
+    """
+    if path.suffix.lower() == ".exr":
+        depth = _decode_exr(path, camera)
+        with np.errstate(invalid="ignore"):
+            is_measured = (depth > 0) & (depth < FARTHEST_DEPTH)  # not so for NaN
+        if format.invalid is not None:
+            is_measured &= depth != np.float32(format.invalid)
+        return np.where(is_measured, depth, np.float32(0))
+    raw = decode(path, cv2.IMREAD_UNCHANGED, camera, "depth")
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DataError(
+            f"{path}: expected a 16-bit single-channel depth PNG, got {raw.dtype} of shape {raw.shape}"
+        )
+    depth = raw.astype(np.float32) * np.float32(format.metres_per_unit)
+    is_missing = (raw == np.iinfo(raw.dtype).max) | (depth >= FARTHEST_DEPTH)
+    if format.invalid is not None:
+        is_missing |= raw == format.invalid
+    depth[is_missing] = 0
+    return depth
+
+
+def _decode_exr(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32
+    """Return the depth channel of an OpenEXR file (OpenCV's wheels no longer read the format)."""
+    import OpenEXR
+
+    data = file_bytes(path, "depth image")
+    try:
+        path.name.encode()
+        source: str | io.BytesIO = str(path)
+    except UnicodeEncodeError:  # OpenEXR takes only names in UTF-8
+        source = io.BytesIO(data)
+    try:
+        with quiet():
+            (left, top), (right, bottom) = OpenEXR.File(source, header_only=True).header()["dataWindow"]
+            shape = (int(bottom) - int(top) + 1, int(right) - int(left) + 1)
+        check_size(path, shape, camera, "depth")  # before a few bytes that promise gigabytes are believed
+        if isinstance(source, io.BytesIO):
+            source.seek(0)
+        with quiet(), OpenEXR.File(source, separate_channels=True) as file, np.errstate(all="ignore"):
+            channels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
+    except DataError:
+        raise
+    except (RuntimeError, ValueError, TypeError, KeyError, OverflowError, MemoryError) as error:
+        raise DataError(f"{path}: not readable as OpenEXR ({' '.join(str(error).split())})") from error
+    for wanted in ("Z", "V", "Y", "R"):  # R: renderers that repeat depth in R, G and B
+        for name, pixels in channels.items():
+            if name.split(".")[-1] == wanted:
+                check_size(path, pixels.shape, camera, "depth")
+                return pixels
+    if len(channels) == 1:
+        return next(iter(channels.values()))
+    raise DataError(f"{path}: expected a channel Z, V, Y or R with depth, got {', '.join(sorted(channels))}")
+
+
+def look_at_images(sequence: EventDepthSequence, folder: Path) -> None:
+    """Read a few depth and grey images of a sequence that is being opened; set its `depth_varies`.
+
+    Raises `DataError` where most of them cannot be read, and where (nearly) all the depth images show one
+    and the same value or none: a sensor that was covered or saturated, or no depth at all. Images that show
+    one value each, but not the same, are a flat wall seen at right angles.
+    """
+    _read_some(len(sequence.image_timestamps), sequence.image, "grey images")
+    depths = _read_some(len(sequence.depth_timestamps), sequence.depth, "depth images")
+    flat = [float(depth.max()) for depth in depths if not has_variation(depth)]  # m, 0: nothing measured
+    varied = len(depths) - len(flat)
+    if depths and len(flat) >= NEARLY_ALL * len(depths):
+        same = {value for value in flat if value > 0}
+        if len(same) < 2:
+            what = f"is missing or {same.pop():.6g} m" if same else "is missing (0 or the largest value)"
+            raise DataError(
+                f"{folder}: depth has no variation: every pixel {what} in {len(flat)} of the {len(depths)} "
+                "depth images looked at; was the sensor covered, or is this not depth?"
+            )
+    sequence.depth_varies = varied > len(flat)
+
+
+def _read_some(number: int, read: Callable[[int], np.ndarray], what: str) -> list[np.ndarray]:
+    """Return a few images spread over a sequence that can be read; raise if most cannot."""
+    indices = np.unique(np.linspace(0, number - 1, LOOKED_AT).astype(int)) if number else np.empty(0, int)
+    images: list[np.ndarray] = []
+    errors: list[DataError | OSError] = []
+    for index in indices:
+        try:
+            images.append(read(int(index)))
+        except (DataError, OSError) as error:
+            errors.append(error)
+    if len(errors) > len(images):
+        raise DataError(f"{errors[0]} ({len(errors)} of {len(indices)} {what} looked at cannot be used)")
+    return images

@@ -1,0 +1,146 @@
+"""Whether events and depth tell the same motion: faults of calibration and clocks that no single frame shows.
+
+At frames with depth the pose is measured twice: by brightness and depth together, where depth outweighs
+brightness, and by brightness alone. With T the first, T_b the second and X the motion since the keyframe k,
+both by T, the disagreement is d = log(T^-1 T_b). Depth images whose stamps are too early by a delay tau show
+where the camera was before, at the keyframe and now, so that
+
+    d = tau (v - Ad(X^-1) v_k) + noise,    v: velocities (translation, rotation) at the frame and the keyframe
+
+which robust least squares solves for tau over all frames. What is left of d, in units of its expected size,
+says whether the two kinds of data contradict each other otherwise (a wrong focal length, events of another
+recording, pixels that fire by themselves). A wrong scale of depth cannot be seen: it scales both.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.geometry import adjoint, inverse, se3_log
+from edslam_ti.kernels.patch_warp import NormalEquations
+from edslam_ti.trajectory import Trajectory
+
+MOST = 60  # frames that are compared, spread over the run
+MIN_FRAMES = 6  # fewer say nothing
+# Squared disagreement over what residuals let expect, median of the frames. Simulated rooms: 9 to 46 where
+# nothing is wrong; depth 50 ms late 480, focal length 10 % too long 910, 20 pixels that fire at 5 kHz 2800.
+CONTRADICTION = 100.0
+# A delay is reported from so many of its standard deviations and so many seconds on. Rooms without a delay:
+# up to 3.5 standard deviations and 3 ms; 10 ms late: 5.2 and 8 ms.
+SURE, SMALLEST_DELAY = 4.5, 0.004
+SMALLEST_SCALE = 1e-6  # of squared residuals
+HUBER = 1.5  # standard deviations
+FROZEN_SHARE = 0.2  # of the compared frames with the depth image of the frame before: depth has stopped
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What a whole run says of its recording."""
+
+    num_frames: int  # compared
+    disagreement: float  # squared, over what residuals let expect
+    depth_delay_s: float  # by which depth images show an earlier time than their stamps
+    depth_delay_sigma_s: float
+    repeated_share: float  # of the compared frames with the very depth image of the frame before
+
+    @property
+    def problems(self) -> list[str]:
+        """One line for each fault that is likely, and what to do."""
+        lines = []
+        is_contradiction = self.disagreement > CONTRADICTION
+        if is_contradiction and self.repeated_share > FROZEN_SHARE:
+            return [
+                f"{self.repeated_share:.0%} of the depth images repeat the one before although events show "
+                "motion: the depth stream has stopped; its poses cannot be right"
+            ]
+        delay, sigma = self.depth_delay_s, self.depth_delay_sigma_s
+        if abs(delay) > max(SURE * sigma, SMALLEST_DELAY):
+            lines.append(
+                f"depth looks {1000 * abs(delay):.0f} ms (+- {1000 * sigma:.0f}) too "
+                f"{'late' if delay > 0 else 'early'} for the events; check the clocks of both streams"
+            )
+        if is_contradiction:
+            lines.append(
+                f"events and depth contradict each other ({np.sqrt(self.disagreement):.0f} times the "
+                f"expected difference of poses, usual are 3 to 7); check focal length, principal point, "
+                "registration of depth to the event camera, and pixels that fire by themselves"
+            )
+        return lines
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """One frame, measured twice."""
+
+    index: int
+    keyframe: int
+    disagreement: np.ndarray  # [6] d
+    information: np.ndarray  # [6, 6] of T_b
+    is_repeated: bool
+
+
+class ConsistencyCheck:
+    """Collects comparisons along a run."""
+
+    def __init__(self) -> None:
+        self._comparisons: list[_Comparison] = []
+        self._every, self._count = 1, 0
+
+    def wants(self) -> bool:
+        """Return whether the next frame with depth is to be compared; half as often when there are many."""
+        self._count += 1
+        return self._count % self._every == 0
+
+    def add(
+        self,
+        index: int,  # of the frame
+        keyframe: int,  # index of the frame it was aligned to
+        T_world_camera: np.ndarray,  # [4, 4] by brightness and depth
+        by_brightness: np.ndarray,  # [4, 4] T_world_camera
+        system: NormalEquations,  # of the latter
+        is_repeated: bool = False,  # its depth image is that of the frame before
+    ) -> None:
+        """Add a frame whose pose was measured twice."""
+        scale = max(2 * system.cost / max(system.num_surface, 1), SMALLEST_SCALE)
+        difference = se3_log(inverse(T_world_camera) @ by_brightness)
+        self._comparisons.append(_Comparison(index, keyframe, difference, system.H / scale, is_repeated))
+        if len(self._comparisons) > MOST:
+            self._comparisons = self._comparisons[1::2]
+            self._every *= 2
+
+    def result(self, trajectory: Trajectory) -> Consistency | None:
+        """Return what the run says; None: too little was compared."""
+        if len(self._comparisons) < MIN_FRAMES:
+            return None
+        observed, expected, squares = [], [], []
+        for c in self._comparisons:
+            X = inverse(trajectory.pose(c.keyframe)) @ trajectory.pose(c.index)
+            change = _velocity(trajectory, c.index) - adjoint(inverse(X)) @ _velocity(trajectory, c.keyframe)
+            root = np.linalg.cholesky(c.information + 1e-9 * np.eye(6)).T
+            observed.append(root @ c.disagreement)
+            expected.append(root @ change)
+            squares.append(float(c.disagreement @ c.information @ c.disagreement) / 6)
+        delay, sigma = _robust_slope(np.concatenate(expected), np.concatenate(observed))
+        repeated = float(np.mean([c.is_repeated for c in self._comparisons]))
+        return Consistency(len(squares), float(np.median(squares)), delay, sigma, repeated)
+
+
+def _velocity(trajectory: Trajectory, index: int) -> np.ndarray:  # [6]
+    """Return the velocity of the body around a frame, metres and radians per second."""
+    a, b = max(index - 1, 0), min(index + 1, len(trajectory) - 1)
+    stamps = trajectory.timestamps
+    return np.asarray(se3_log(inverse(trajectory.pose(a)) @ trajectory.pose(b)) / (stamps[b] - stamps[a]))
+
+
+def _robust_slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:  # [N], [N]
+    """Return a in y = a x, and its standard deviation, by iteratively reweighted least squares (Huber)."""
+    weight, slope, scale = np.ones(len(x)), 0.0, 1.0
+    for _ in range(10):
+        information = float((weight * x * x).sum())
+        if information <= 0:
+            return 0.0, float("inf")
+        slope = float((weight * x * y).sum()) / information
+        residual = y - slope * x
+        scale = 1.48 * float(np.median(np.abs(residual))) + 1e-9
+        weight = 1 / np.maximum(1, np.abs(residual) / (HUBER * scale))
+    return slope, scale / float(np.sqrt((weight * x * x).sum()))
