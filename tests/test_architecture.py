@@ -105,8 +105,8 @@ LIBRARIES: dict[str, list[str]] = {
     "psutil": ["experiments.long_stream"],
 }
 USES_OPEN3D = [
+    "mesh_reading",
     *(
-        "mesh_reading",
         "ray_casting",
         "simulation",
         "evaluation",

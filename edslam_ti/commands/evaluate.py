@@ -61,11 +61,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         Console().print(line, style="yellow", markup=False, highlight=False, soft_wrap=True)
     if options.mesh is not None and options.recording is not None:
         from edslam_ti.datasets.event_replica import EventReplicaSequence
-        from edslam_ti.evaluation.meshes import mesh_errors, read_triangles
+        from edslam_ti.evaluation.meshes import mesh_errors
+        from edslam_ti.mesh_reading import read_triangle_mesh
 
         sequence = EventReplicaSequence(options.recording)
         estimate = Trajectory(estimate.timestamps - sequence.time_offset, estimate.poses)
-        surface = mesh_errors(read_triangles(options.mesh), sequence, estimate)
+        surface = mesh_errors(read_triangle_mesh(options.mesh), sequence, estimate)
         print(
             f"mesh accuracy {surface.accuracy_cm:.3f} cm, completion {surface.completion_cm:.3f} cm, "
             f"{100 * surface.completion_ratio:.2f} % within 5 cm"

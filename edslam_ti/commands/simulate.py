@@ -11,6 +11,7 @@ from typing import Literal
 
 from edslam_ti.arguments import read_options
 from edslam_ti.cold_start import load_kernels
+from edslam_ti.errors import plain
 from edslam_ti.simulation.settings import SimulationConfig
 
 Vector = tuple[float, float, float]
@@ -55,14 +56,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     from rich.markup import escape
     from rich.progress import Progress
 
-    from edslam_ti.errors import plain
     from edslam_ti.simulation.catalogue import ROOM_NAMES
     from edslam_ti.simulation.command import Placement, record
 
     start, scale = options.trajectory_start, options.trajectory_scale
+    name = options.mesh.name if options.mesh else options.scene
     with Progress(transient=True) as bar:
-        what = plain(options.mesh.name if options.mesh else str(options.scene))
-        task = bar.add_task(f"simulating {escape(what)}", total=1.0)
+        task = bar.add_task(f"simulating {escape(plain(name))}", total=1.0)
         written = record(
             scene_name=options.scene,
             mesh=options.mesh,

@@ -11,6 +11,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation.trajectories import align_views
+from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.ray_casting import RayCaster, pixel_rays
 from edslam_ti.trajectory import Trajectory
@@ -46,7 +47,7 @@ class TrueSurfaces:
 
     def __init__(self, path: Path) -> None:
         """Read a mesh file; raise FileNotFoundError or DataError where there is none."""
-        self._caster = RayCaster.of_mesh(read_triangles(path))
+        self._caster = RayCaster.of_mesh(read_triangle_mesh(path))
 
     def depth(self, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:  # [H, W] metres, 0 = nothing
         """Return the depth seen from a pose."""
@@ -144,16 +145,6 @@ def seen_pixels(
 def viewpoints(path: Trajectory) -> list[np.ndarray]:  # [4, 4] each
     """Return a subset of a path's poses that together see everything the path sees."""
     return path.spread(VIEW_STEP, VIEW_TURN)
-
-
-def read_triangles(path: Path) -> Any:
-    """Return the Open3D TriangleMesh in a file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: mesh not found")
-    mesh = load_open3d().io.read_triangle_mesh(str(path))
-    if len(mesh.triangles) == 0:
-        raise DataError(f"{path}: expected a mesh, could not read any triangle")
-    return mesh
 
 
 def _world_points(depth: np.ndarray, camera: Camera, T: np.ndarray) -> np.ndarray:  # [N, 3] metres, world

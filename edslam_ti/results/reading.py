@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edslam_ti.errors import DataError
-from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.mesh_reading import read_point_cloud, read_triangle_mesh
 from edslam_ti.trajectory import Trajectory, read_tum
 
 
@@ -48,17 +48,12 @@ def load_result(folder: Path) -> Result:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{metrics_path}: not readable as JSON ({error})") from error
     points = brightness = mesh = None
-    o3d = load_open3d()
     if (folder / "points.ply").is_file():
-        cloud = o3d.io.read_point_cloud(str(folder / "points.ply"))
-        if not len(cloud.points):
-            raise DataError(f"{folder / 'points.ply'}: expected a point cloud, could not read any point")
+        cloud = read_point_cloud(folder / "points.ply")
         points = np.asarray(cloud.points)
         brightness = np.asarray(cloud.colors).mean(1) if cloud.has_colors() else np.full(len(points), 0.5)
     if (folder / "mesh.ply").is_file():
-        mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
-        if not len(mesh.triangles):
-            raise DataError(f"{folder / 'mesh.ply'}: expected a mesh, could not read any triangle")
+        mesh = read_triangle_mesh(folder / "mesh.ply")
     return Result(
         folder=folder,
         trajectory=read_tum(trajectory_path),

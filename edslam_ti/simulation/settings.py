@@ -1,12 +1,11 @@
 """Settings of a simulated recording."""
 
-import reprlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError
 
 from edslam_ti.config import Stage
-from edslam_ti.errors import ConfigError
+from edslam_ti.errors import ConfigError, shown
 
 if TYPE_CHECKING:  # it loads numpy, which options need not wait for
     from edslam_ti.camera import Camera
@@ -75,7 +74,7 @@ class SimulationConfig(Stage):
         except ValidationError as error:
             problem = error.errors()[0]
             name = ".".join(str(part) for part in problem["loc"])
-            raise ConfigError(f"{name}: {problem['msg']}, got {reprlib.repr(problem['input'])}") from error
+            raise ConfigError(f"{name}: {problem['msg']}, got {shown(problem['input'])}") from error
 
     @property
     def camera(self) -> "Camera":

@@ -7,7 +7,8 @@ import pytest
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
-from edslam_ti.evaluation.meshes import SPACING, TrueSurfaces, read_triangles, seen_pixels, seen_points
+from edslam_ti.evaluation.meshes import SPACING, TrueSurfaces, seen_pixels, seen_points
+from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.open3d_loader import load_open3d
 
 CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
@@ -89,7 +90,7 @@ def test_a_mesh_without_triangles_is_refused(surfaces: TrueSurfaces, tmp_path: P
     with pytest.raises(DataError, match="got 0 triangles"):
         surfaces.errors(empty, np.zeros((1, 3), np.float32), np.eye(4))
     with pytest.raises(FileNotFoundError, match="mesh not found"):
-        read_triangles(tmp_path / "none.ply")
+        read_triangle_mesh(tmp_path / "none.ply")
     (tmp_path / "bad.ply").write_text("no mesh")
     with pytest.raises(DataError, match="could not read any triangle"):
-        read_triangles(tmp_path / "bad.ply")
+        read_triangle_mesh(tmp_path / "bad.ply")

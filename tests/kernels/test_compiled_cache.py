@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from edslam_ti.kernels.compiled_cache import CompiledKernels, _checksums
-from edslam_ti.kernels.engine import ti
+from edslam_ti.kernels.engine import ENGINE, ti
 
 ROOT = Path(__file__).parents[2]
 RUNS_A_KERNEL = """
@@ -49,7 +49,7 @@ def ran_well(done: subprocess.CompletedProcess[str]) -> bool:
 
 def kept_files(cache: Path) -> dict[str, bytes]:
     (folder,) = (cache / "kernels").iterdir()
-    return {path.name: path.read_bytes() for path in sorted((folder / "compiled").rglob("*.tic"))}
+    return {path.name: path.read_bytes() for path in sorted((folder / "compiled").rglob("T*.*"))}
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
 def test_the_second_run_uses_what_the_first_compiled(copy: Path) -> None:
     before = kept_files(copy)
     assert before
-    (file,) = (copy / "kernels").rglob("*.tic")
+    (file,) = (copy / "kernels").rglob("T*.*")
     stamp = file.stat().st_mtime_ns
     done = run({"EDSLAM_CACHE": str(copy)})
     assert ran_well(done)
@@ -96,6 +96,7 @@ def make_link(path: Path) -> None:
     path.symlink_to("/etc/passwd")
 
 
+LOCK = {"taichi": "ticache.lock", "quadrants": "qdcache.lock"}[ENGINE]
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "flipped": flip,
     "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
@@ -126,7 +127,7 @@ def test_a_damaged_cache_is_made_anew_once(copy: Path, damage: str) -> None:
     assert again.stderr == ""
 
 
-@pytest.mark.parametrize("which", ["*", "*.tic", "*.tcb", "checksums.json"])
+@pytest.mark.parametrize("which", ["*", "T*.*", "*cache.*", "checksums.json"])
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_files_are_removed_before_the_engine_reads_them(
     copy: Path, damage: str, which: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -155,7 +156,7 @@ def test_a_lock_that_a_killed_engine_left_does_not_stop_the_cache(copy: Path) ->
     shutil.rmtree(folder / "compiled")
     (folder / "checksums.json").unlink()
     (folder / "compiled").mkdir()
-    (folder / "compiled" / "ticache.lock").write_text("")
+    (folder / "compiled" / LOCK).write_text("")
     assert ran_well(run({"EDSLAM_CACHE": str(copy)}))
     assert len(kept_files(copy)) == 1
 
@@ -200,7 +201,7 @@ CRASHES = (
     RUNS_A_KERNEL
     + """
 import os, signal
-from taichi.lang import kernel_impl
+from ENGINE.lang import kernel_impl
 def crash(*args): os.kill(os.getpid(), signal.SIGSEGV)
 HOW
 """
@@ -219,7 +220,7 @@ HOW
     ids=["in the engine", "elsewhere", "killed"],
 )  # fmt: skip
 def test_a_crash_in_the_engine_discards_the_cache(copy: Path, how: str, is_remade: bool) -> None:
-    done = run({"EDSLAM_CACHE": str(copy)}, CRASHES.replace("HOW", how))
+    done = run({"EDSLAM_CACHE": str(copy)}, CRASHES.replace("HOW", how).replace("ENGINE", ENGINE))
     assert done.returncode < 0
     again = run({"EDSLAM_CACHE": str(copy)})
     assert ran_well(again)
@@ -263,4 +264,5 @@ def test_the_check_takes_little_time(tmp_path: Path) -> None:
 def test_checksums_name_every_file(made: Path) -> None:
     (folder,) = (made / "kernels").iterdir()
     noted = json.loads((folder / "checksums.json").read_text())
-    assert sorted(noted) == sorted(path.name for path in (folder / "compiled").iterdir())
+    files = [path for path in (folder / "compiled").rglob("*") if path.is_file()]
+    assert sorted(noted) == sorted(path.relative_to(folder / "compiled").as_posix() for path in files)
