@@ -4,7 +4,9 @@ Settings come from, each overriding the one before: defaults, configs/<dataset>.
 --config FILE, flags. Every field of `Config` is a flag, `--stage.field VALUE` for nested ones.
 """
 
+import contextlib
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,10 +16,13 @@ from pydantic import Field
 
 from edslam_ti.arguments import Shown, UsageError, nearest_name_hint, read_given
 from edslam_ti.config import CONFIGS, Config, dataset_differences, merged, read_differences
-from edslam_ti.errors import ConfigError, EdSlamError
+from edslam_ti.errors import LONGEST_MESSAGE, ConfigError, EdSlamError, LostTrackError, plain
+from edslam_ti.interruption import Stopped
 from edslam_ti.methods import METHODS
 
-FAILED, USAGE, INTERRUPTED = 1, 2, 130  # exit codes; 130 is the shell's for Ctrl-C
+# Exit codes. A command that a signal has ended adds the signal's number to SIGNALLED, as the shell does:
+# 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
+FAILED, USAGE, LOST, SIGNALLED = 1, 2, 3, 128
 
 
 class _RunOptions(Config):
@@ -73,20 +78,26 @@ def launch(main: Callable[[], None]) -> None:
         main()
     except UsageError as error:
         _exit(USAGE, f"{error} (--help lists the options)")
+    except LostTrackError as error:
+        _exit(LOST, str(error))
     except EdSlamError as error:
         _exit(FAILED, str(error))
     except BrokenPipeError:  # the reader of our output is gone, as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
-    except OSError as error:
-        if error.filename is None and not isinstance(error, FileNotFoundError | PermissionError):
-            raise
+    except OSError as error:  # of the system: a full disk, say, which names no file
         reason = error.strerror or str(error)
         _exit(FAILED, f"{error.filename}: {reason}" if error.filename is not None else str(error))
+    except Stopped as stopped:
+        _exit(
+            SIGNALLED + stopped.number,
+            "interrupted" if stopped.number == signal.SIGINT else f"stopped by {stopped}",
+        )
     except KeyboardInterrupt:
-        _exit(INTERRUPTED, "interrupted")
+        _exit(SIGNALLED + signal.SIGINT, "interrupted")
 
 
 def _exit(code: int, message: str) -> NoReturn:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody reads it any more
+        print(f"error: {plain(' '.join(message.split()), LONGEST_MESSAGE)}", file=sys.stderr)
     sys.exit(code)

@@ -42,6 +42,10 @@ class Trajectory:
         """Return key pose `index`; negative counts from the end."""
         return self._poses[index]
 
+    def timestamp(self, index: int) -> float:  # seconds
+        """Return the time of key pose `index`; negative counts from the end."""
+        return self._timestamps[index]
+
     def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
         """Add a pose later than all others."""
         if self._timestamps and timestamp <= self._timestamps[-1]:

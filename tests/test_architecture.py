@@ -10,9 +10,12 @@ ROOT = Path(__file__).parents[1]
 # Ranks from the bottom to the top. A name is a module of edslam_ti or a folder of it. Modules of one rank do
 # not import each other, but for those in the order of ORDERS.
 RANKS: list[list[str]] = [
-    ["kernels", "errors", "memory", "output", "open3d_loader", "cold_start"],
+    [
+        *("kernels", "errors", "memory", "output", "open3d_loader", "cold_start", "interruption"),
+        "patient_console",
+    ],
     ["config", "arguments", "geometry", "camera", "events"],
-    ["trajectory", "depth_images", "ray_casting", "alignment", "simulation"],
+    ["trajectory", "journal", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
     ["event_images"],
@@ -29,9 +32,11 @@ RANKS: list[list[str]] = [
 # that are not listed may import freely inside, without a cycle.
 ORDERS: dict[str, list[str]] = {
     "ranks": [
-        *("errors", "memory", "output", "open3d_loader", "kernels", "cold_start"),
+        *("errors", "memory", "output", "open3d_loader", "kernels", "cold_start", "interruption"),
+        "patient_console",
         *("config", "arguments", "geometry", "camera", "events"),
-        *("trajectory", "depth_images", "ray_casting", "alignment", "simulation", "frame", "evaluation"),
+        *("trajectory", "journal", "depth_images", "ray_casting", "alignment", "simulation", "frame"),
+        "evaluation",
         *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
     ],
     "event_images": ["change", "solve", "contrast", "sharp"],
@@ -45,7 +50,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": ["trajectories", "lpips", "images", "meshes"],
     "results": [
-        *("run", "reading", "export", "maps", "pictures", "plots", "window", "views", "metrics", "folder"),
+        *("run", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
+        *("metrics", "folder"),
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
@@ -60,7 +66,7 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": ["config", "arguments", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
-    "scipy": ["trajectory", "simulation", "mapping", "results"],
+    "scipy": ["trajectory", "journal", "simulation", "mapping", "results"],
     "cv2": [
         *("alignment", "depth_images", "datasets", "simulation", "event_images", "tracking", "mapping"),
         "results",
@@ -74,7 +80,7 @@ LIBRARIES: dict[str, list[str]] = {
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
     "matplotlib": ["results"],
-    "rich": ["datasets", "results", "pipeline", "experiments", "commands"],
+    "rich": ["patient_console", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
 }
 USES_OPEN3D = [

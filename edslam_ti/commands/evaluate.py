@@ -18,7 +18,7 @@ class EvaluateOptions(Stage):
     """What to compare."""
 
     estimate: Annotated[Path, Shown("EST.txt", is_positional=True)]
-    """Estimated trajectory, TUM format."""
+    """Estimated trajectory, TUM format; or the journal.csv of a run that was cut off."""
     truth: Annotated[Path, Shown("TRUTH.txt", is_positional=True)]
     """True trajectory, TUM format."""
     mesh: Path | None = None
@@ -33,9 +33,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     if (options.mesh is None) != (options.recording is None):
         raise UsageError("--mesh and --recording: expected both or neither; give the missing one")
     from edslam_ti.evaluation.trajectories import statistics, trajectory_errors
+    from edslam_ti.journal import read_journal
     from edslam_ti.trajectory import read_tum
 
-    estimate = read_tum(options.estimate)
+    is_journal = options.estimate.suffix == ".csv"
+    estimate = read_journal(options.estimate) if is_journal else read_tum(options.estimate)
     errors = trajectory_errors(estimate, read_tum(options.truth))
     print(f"{errors.num_poses} poses compared over {errors.timestamps[-1] - errors.timestamps[0]:.3f} s")
     tables = {

@@ -23,5 +23,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     load_kernels()
     config = with_presets(choices, differences)
     from edslam_ti.pipeline import run  # torch and Taichi take seconds to load
+    from edslam_ti.results.reading import require_tracked
 
-    run(config)
+    require_tracked(run(config))

@@ -32,6 +32,11 @@ class Run:
         """Add a line to the log, with the seconds since the start."""
         self.messages.append(f"{time.perf_counter() - self.started:8.2f} s  {message}")
 
+    def note_once(self, message: str) -> None:
+        """Add a line to the log unless it is there."""
+        if not any(line.endswith(message) for line in self.messages):
+            self.note(message)
+
     def true_trajectory(self) -> Trajectory | None:
         """Return the truth at those tracked times that it covers; None where there is none.
 
