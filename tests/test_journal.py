@@ -51,7 +51,7 @@ def test_line_that_was_cut_off_does_not_count(tmp_path: Path) -> None:
     path = tmp_path / "journal.csv"
     write(path, curve(10)).close()
     data = path.read_bytes()
-    for length in range(len(data) - 100, len(data)):
+    for length in range(len(data) - 60, len(data) - 1):
         path.write_bytes(data[:length])
         assert len(read_journal(path)) == 9, length
     Journal(path, 0.0).close()  # a resumed run goes on in a new line
