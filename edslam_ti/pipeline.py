@@ -1,7 +1,8 @@
 """A whole run: sequence in, results folder out, with progress, numbers and pictures on the way.
 
 Nothing is lost on the way. The folder is made before the first frame, and every pose goes into its journal
-at once. Whatever ends the run early, the path and the map so far are saved.
+at once, and its state into a checkpoint now and then. Whatever ends the run early, the path and the map so
+far are saved.
 """
 
 import time
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from edslam_ti import kernels
+from edslam_ti.checkpoint import Keeper
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence, find_sequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError, plain
@@ -23,6 +25,7 @@ from edslam_ti.evaluation.meshes import read_triangles
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
+from edslam_ti.identity import compare, identity_of
 from edslam_ti.interruption import Interruption, Stopped, signals_handled
 from edslam_ti.journal import JOURNAL, Journal
 from edslam_ti.mapping.mapper import Mapper
@@ -46,6 +49,7 @@ class _Session:
 
     folder: RunFolder
     journal: Journal
+    keeper: Keeper
     interruption: Interruption
     viewer: Viewer
     console: Console
@@ -62,20 +66,51 @@ def run(config: Config, console: Console | None = None) -> Path:
     console = console or patient_console()
     with signals_handled() as interruption:
         folder = RunFolder.make(_parent(config))
-        is_worth_keeping = False
+        state: Run | None = None
         try:
             folder.write(SETTINGS, config.to_yaml())
-            folder.set_state(RUNNING)
             viewer, state = _prepare(config, console)
+            folder.identity = identity_of(config)
+            folder.set_state(RUNNING)
             journal = Journal(folder.path / JOURNAL, state.sequence.time_offset)
-            try:
-                _run(state, _Session(folder, journal, interruption, viewer, console))
-            finally:
-                is_worth_keeping = len(state.slam.trajectory) > 0
+            keeper = Keeper(state, folder.checkpoints, config.checkpoint)
+            _run(state, _Session(folder, journal, keeper, interruption, viewer, console))
         finally:
             folder.close()
-            if not is_worth_keeping:
+            if state is None or len(state.slam.trajectory) == 0:
                 folder.discard()
+    return folder.path
+
+
+def resume(path: Path, config: Config, console: Console | None = None) -> Path:
+    """Go on with a run that was cut off, in its folder, and return that.
+
+    `config` holds the settings of its config.yaml; only `checkpoint` and `visualize` may differ. Trajectory
+    and map come out as if the run had not been cut off: its last checkpoint is restored, and the frames since
+    then are processed again. Raises what `run` raises, and DataError where the run has finished, where
+    another process is at it, or where the recording or the program have changed.
+    """
+    console = console or patient_console()
+    with signals_handled() as interruption:
+        folder = RunFolder.reopen(path)
+        try:
+            viewer, state = _prepare(config, console)
+            notes = compare(folder.identity, identity_of(config), folder.path)
+            if config.mapping.budget is not None:
+                notes.append("mapping.budget depends on the machine's speed: results will differ")
+            keeper = Keeper(state, folder.checkpoints, config.checkpoint)
+            is_restored = keeper.restore()
+            num_done = len(state.slam.results)
+            where = f"frame {num_done + 1} of {len(state.samples)}" if is_restored else "the first frame"
+            for line in (f"resumed from {where}", *notes):
+                state.note(line)
+                console.print(plain(line))
+            folder.set_state(RUNNING)
+            journal = Journal(folder.path / JOURNAL, state.sequence.time_offset)
+            journal.begin_with(state.slam.trajectory)
+            _run(state, _Session(folder, journal, keeper, interruption, viewer, console))
+        finally:
+            folder.close()
     return folder.path
 
 
@@ -129,19 +164,21 @@ def _check_truth_of_views(state: Run, console: Console) -> None:
 
 def _run(state: Run, session: _Session) -> None:
     """Process all frames, refine the map and save; whatever ends this early, save what there is."""
-    interruption, slam = session.interruption, state.slam
+    interruption = session.interruption
     failure: Exception | None = None
     with interruption.deferred():
         try:
             _process(state, session)
-            if slam.mapper is not None and not interruption.requested:
-                _finish(state, slam.mapper, session)
+            if interruption.requested and not interruption.is_urgent:
+                session.keeper.keep()
+            if state.slam.mapper is not None and not interruption.requested and not state.is_refined:
+                _finish(state, state.slam.mapper, session)
         except Stopped:
             pass  # the signal is known, and that it is urgent
         except Exception as error:
             failure = _told(error, state)
         state.is_interrupted = interruption.requested or failure is not None
-        if len(slam.trajectory) > 0:  # else there is nothing to save
+        if len(state.slam.trajectory) > 0:  # else there is nothing to save
             failure = _save(state, session, failure)
     session.viewer.close()
     if failure is not None:
@@ -156,6 +193,9 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
     if state.is_interrupted:
         console.print("interrupted: saving what there is")
         state.note("interrupted")
+    keeper = session.keeper
+    if keeper.num_written:
+        state.note(f"checkpoints: {keeper.num_written}, {keeper.spent:.2f} s")
     try:
         session.journal.close(state.slam.trajectory)
         save(state, folder.path, console, interruption)
@@ -284,20 +324,28 @@ def _process(state: Run, session: _Session) -> None:
             if mapper is not None:
                 status += f"  {mapper.num_gaussians} Gaussians  loss {mapper.loss:.3f}"
             bar.update(task, advance=1, status=status + ate)
+            session.keeper.keep_if_due()
             session.viewer.update(slam.trajectory, mapper, state.sequence.camera)
 
 
 def _finish(state: Run, mapper: Mapper, session: _Session) -> None:
     """Refine the map, until a signal comes."""
-    started = time.perf_counter()
+    started, interruption = time.perf_counter(), session.interruption
     with _progress(session.console) as bar:
         task = bar.add_task("refining", total=100, status="")
 
         def report(fraction: float) -> bool:
             bar.update(task, completed=int(100 * fraction), status=f"loss {mapper.loss:.3f}")
             session.journal.correct(state.slam.trajectory)
-            return not session.interruption.requested
+            if interruption.requested and not interruption.is_urgent:
+                session.keeper.keep()
+            elif not interruption.requested:
+                session.keeper.keep_if_due()
+            return not interruption.requested
 
         mapper.finish(state.slam.trajectory, report)
         bar.update(task, completed=100)
     state.finish_seconds += time.perf_counter() - started
+    if not interruption.requested:
+        state.is_refined = True
+        session.keeper.keep_if_due()

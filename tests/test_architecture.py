@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 RANKS: list[list[str]] = [
     [
         *("kernels", "errors", "memory", "output", "open3d_loader", "cold_start", "interruption"),
-        "patient_console",
+        *("patient_console", "object_graph"),
     ],
     ["config", "arguments", "geometry", "camera", "events"],
     ["trajectory", "journal", "depth_images", "ray_casting", "alignment", "simulation"],
@@ -22,7 +22,7 @@ RANKS: list[list[str]] = [
     ["tracking", "mapping"],
     ["slam", "baselines", "viewer"],
     ["methods", "results"],
-    ["pipeline", "command_line"],
+    ["identity", "checkpoint", "pipeline", "command_line"],
     ["experiments"],
     ["commands"],
     ["apps"],
@@ -33,11 +33,12 @@ RANKS: list[list[str]] = [
 ORDERS: dict[str, list[str]] = {
     "ranks": [
         *("errors", "memory", "output", "open3d_loader", "kernels", "cold_start", "interruption"),
-        "patient_console",
+        *("patient_console", "object_graph"),
         *("config", "arguments", "geometry", "camera", "events"),
         *("trajectory", "journal", "depth_images", "ray_casting", "alignment", "simulation", "frame"),
         "evaluation",
-        *("viewer", "slam", "baselines", "methods", "results", "pipeline", "command_line"),
+        *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
+        "command_line",
     ],
     "event_images": ["change", "solve", "contrast", "sharp"],
     "tracking": [
@@ -64,11 +65,20 @@ LIBRARIES: dict[str, list[str]] = {
     "taichi": ["kernels.engine", "kernels.taichi_speedups"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
-    "pydantic": ["config", "arguments", "command_line", "simulation", "datasets"],
+    "pydantic": ["config", "arguments", "checkpoint", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
     "scipy": ["trajectory", "journal", "simulation", "mapping", "results"],
     "cv2": [
-        *("alignment", "depth_images", "datasets", "simulation", "event_images", "tracking", "mapping"),
+        *(
+            "alignment",
+            "identity",
+            "depth_images",
+            "datasets",
+            "simulation",
+            "event_images",
+            "tracking",
+            "mapping",
+        ),
         "results",
     ],
     "OpenEXR": ["datasets"],

@@ -24,6 +24,7 @@ class Run:
     contrast: ContrastThreshold
     num_events: int = 0
     finish_seconds: float = 0.0
+    is_refined: bool = False  # the map's final steps are done
     is_interrupted: bool = False
     started: float = field(default_factory=time.perf_counter)
     messages: list[str] = field(default_factory=list)

@@ -25,6 +25,7 @@ class RunFolder:
         self.path = path
         self._lock = lock  # file descriptor
         self._made = made  # folders that were not there before, the outermost first
+        self.identity: dict[str, Any] = {}  # what the run's result depends on
 
     @classmethod
     def make(cls, parent: Path) -> "RunFolder":
@@ -55,9 +56,11 @@ class RunFolder:
                 "in it"
             )
         folder = cls(path, _locked(path), [])
-        if (read_state(path) or {}).get("state") == FINISHED:
+        state = read_state(path) or {}
+        if state.get("state") == FINISHED:
             folder.close()
             raise DataError(f"{path}: this run has finished; there is nothing to resume")
+        folder.identity = state.get("identity") or {}
         return folder
 
     @property
@@ -76,6 +79,7 @@ class RunFolder:
             "state": state,
             "version": __version__,
             "process": os.getpid(),
+            "identity": self.identity,
         }
         self.write(STATE, json.dumps(about, indent=2) + "\n")
 
