@@ -154,7 +154,7 @@ class _Writer:
             name = f"{kind.__module__}:{kind.__qualname__}"
             if isinstance(value, tuple) and hasattr(kind, "_fields"):
                 return ["named", name, self._values(value, way)]
-            if hasattr(value, "__dict__"):
+            if kind.__new__ is object.__new__ and hasattr(value, "__dict__"):
                 parts = {n: self._value(part, f"{way}.{n}") for n, part in _attributes(value)}
                 return ["object", name, parts]
         raise StateError(f"{way}: {kind.__module__}.{kind.__qualname__} is no state that can be kept")
