@@ -115,8 +115,10 @@ def killed_and_resumed(recording: Path, out: Path, rng: random.Random) -> tuple[
 
 
 def differences(folder: Path, reference: Path) -> list[str]:
-    """Return the names of the files that differ from those of the uninterrupted run."""
-    return [n for n in COMPARED if (folder / n).read_bytes() != (reference / n).read_bytes()]
+    """Return the names of the files that differ from those of the uninterrupted run, or are not in both."""
+    wrong = [n for n in COMPARED if (folder / n).read_bytes() != (reference / n).read_bytes()]
+    names, expected = ({str(p.relative_to(f)) for p in f.rglob("*")} for f in (folder, reference))
+    return wrong + sorted(names ^ expected)  # nothing is missing, nothing is left over
 
 
 def main() -> int:

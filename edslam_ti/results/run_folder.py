@@ -61,6 +61,8 @@ class RunFolder:
             folder.close()
             raise DataError(f"{path}: this run has finished; there is nothing to resume")
         folder.identity = state.get("identity") or {}
+        for partial in path.rglob(".*.partial*"):  # of files that the process that was cut off did not finish
+            partial.unlink(missing_ok=True)
         return folder
 
     @property
