@@ -42,9 +42,14 @@ class PatientStream:
             os.close(null)
 
 
+def say(console: Console, line: str) -> None:
+    """Print a line as it is: nothing in it is markup, and the terminal wraps it."""
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 def patient_console() -> Console:
     """Return a console on the standard output, which must not end a run: `edslam slam | head -1`."""
     if sys.stdout is None:  # a process without output
         return Console(quiet=True)
     stream: Any = PatientStream(sys.stdout)
-    return Console(file=stream, markup=False, highlight=False)
+    return Console(file=stream)

@@ -31,7 +31,7 @@ from edslam_ti.journal import JOURNAL, Journal
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.memory import release_free_memory
 from edslam_ti.methods import METHODS
-from edslam_ti.patient_console import patient_console
+from edslam_ti.patient_console import patient_console, say
 from edslam_ti.results.folder import save
 from edslam_ti.results.run import Run
 from edslam_ti.results.run_folder import FAILED, INTERRUPTED, RUNNING, SETTINGS, RunFolder, point_latest_to
@@ -69,6 +69,7 @@ def run(config: Config, console: Console | None = None) -> Path:
         state: Run | None = None
         try:
             folder.write(SETTINGS, config.to_yaml())
+            folder.set_state(RUNNING)
             viewer, state = _prepare(config, console)
             folder.identity = identity_of(config)
             folder.set_state(RUNNING)
@@ -95,7 +96,10 @@ def resume(path: Path, config: Config, console: Console | None = None) -> Path:
         folder = RunFolder.reopen(path)
         try:
             viewer, state = _prepare(config, console)
-            notes = compare(folder.identity, identity_of(config), folder.path)
+            identity, notes = identity_of(config), list[str]()
+            if folder.identity:  # else it was cut off before there was anything to depend on
+                notes += compare(folder.identity, identity, folder.path)
+            folder.identity = folder.identity or identity
             if config.mapping.budget is not None:
                 notes.append("mapping.budget depends on the machine's speed: results will differ")
             keeper = Keeper(state, folder.checkpoints, config.checkpoint)
@@ -104,7 +108,7 @@ def resume(path: Path, config: Config, console: Console | None = None) -> Path:
             where = f"frame {num_done + 1} of {len(state.samples)}" if is_restored else "the first frame"
             for line in (f"resumed from {where}", *notes):
                 state.note(line)
-                console.print(plain(line))
+                say(console, plain(line))
             folder.set_state(RUNNING)
             journal = Journal(folder.path / JOURNAL, state.sequence.time_offset)
             journal.begin_with(state.slam.trajectory)
@@ -139,10 +143,11 @@ def _prepare(config: Config, console: Console) -> tuple[Viewer, Run]:
     camera, (first, last) = sequence.camera, samples.timestamps[[0, -1]]
     scene, description = plain(sequence.scene), plain(sequence.description)
     state.note(f"{scene}: {description}, method {config.method}")
-    console.print(Text(scene, "bold") + Text(f": {description}"))
-    console.print(
+    console.print(Text(scene, "bold") + Text(f": {description}"), soft_wrap=True)
+    say(
+        console,
         f"{camera.width}x{camera.height}, {last - first:.2f} s, {len(samples)} frames, "
-        f"method {config.method} on {config.device}"
+        f"method {config.method} on {config.device}",
     )
     if config.mapping.enabled:
         _check_truth_of_views(state, console)
@@ -159,7 +164,7 @@ def _check_truth_of_views(state: Run, console: Console) -> None:
     except (DataError, OSError) as error:
         line = f"left out of evaluation: {plain(error)}"
         state.note(line)
-        console.print(line)
+        say(console, line)
 
 
 def _run(state: Run, session: _Session) -> None:
@@ -177,7 +182,6 @@ def _run(state: Run, session: _Session) -> None:
             pass  # the signal is known, and that it is urgent
         except Exception as error:
             failure = _told(error, state)
-        state.is_interrupted = interruption.requested or failure is not None
         if len(state.slam.trajectory) > 0:  # else there is nothing to save
             failure = _save(state, session, failure)
     session.viewer.close()
@@ -190,9 +194,10 @@ def _run(state: Run, session: _Session) -> None:
 def _save(state: Run, session: _Session, failure: Exception | None) -> Exception | None:
     """Save what there is; return what ended the run, or else what kept results from being saved."""
     folder, interruption, console = session.folder, session.interruption, session.console
-    if state.is_interrupted:
-        console.print("interrupted: saving what there is")
+    if interruption.requested or failure is not None:
+        state.is_interrupted = True
         state.note("interrupted")
+        say(console, "interrupted: saving what there is")
     keeper = session.keeper
     if keeper.num_written:
         state.note(f"checkpoints: {keeper.num_written}, {keeper.spent:.2f} s")
@@ -210,8 +215,8 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
     except OSError as error:
         failure, problem = failure or error, ""
     if problem:
-        console.print(plain(problem))
-    console.print(f"results: {plain(folder.path, 4096)}", soft_wrap=True)
+        say(console, plain(problem))
+    say(console, f"results: {plain(folder.path, 4096)}")
     return failure
 
 
@@ -224,8 +229,8 @@ def _told(error: Exception, state: Run) -> Exception:
         state.note(line.rstrip())
     where = traceback.extract_tb(error.__traceback__)[-1]
     told = EdSlamError(
-        f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno}); what there is has "
-        "been saved, and log.txt says more"
+        f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno}); this is a defect of "
+        "the program, please report it" + ("; log.txt says more" if len(state.slam.trajectory) > 0 else "")
     )
     told.__cause__ = error
     return told
@@ -239,7 +244,7 @@ def open_recording(config: Config, console: Console | None = None) -> EventDepth
             f"the recording in {folder}" if folder else f"none in {config.data_dir}, so the built-in stand-in"
         )
         line = f"scene {plain(config.scene)}: {plain(where, 4096)}"
-        (console or patient_console()).print(line, soft_wrap=True, markup=False, highlight=False)
+        say(console or patient_console(), line)
     return open_sequence(config)
 
 
@@ -300,6 +305,8 @@ def _process(state: Run, session: _Session) -> None:
             if session.interruption.requested:
                 break
             sample, problem = state.samples.as_far_as_readable(k)
+            if not problem and state.samples.has_depth[k] and sample.depth is None:
+                problem = "its depth image cannot be used"
             if problem:
                 state.note(f"frame {k} at {sample.timestamp:.3f} s: {problem}")
             num_unreadable = num_unreadable + 1 if problem else 0

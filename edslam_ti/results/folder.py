@@ -16,6 +16,7 @@ from edslam_ti.evaluation.images import LinearFit
 from edslam_ti.interruption import Interruption, Stopped
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.output import atomic_file
+from edslam_ti.patient_console import say
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_of
 from edslam_ti.results.pictures import NoEncoderError, fly_through_frames, smooth_path, write_video
@@ -77,7 +78,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
         run.note("saved" if parts.error is None else f"not all could be saved: {parts.error}")
         parts.write("log", lambda: _write_log(run, folder))
     for line in parts.left_out:
-        console.print(line)
+        say(console, line)
     if parts.error is not None:
         raise parts.error
     if metrics is not None:
@@ -195,11 +196,12 @@ def _print_summary(metrics: Metrics, console: Console) -> None:
         value = metrics.get(name)
         return "-" if value is None else f"{value:.2f} {unit}"
 
-    console.print(
+    say(
+        console,
         f"ATE {show('ate_rmse_cm', 'cm')}  RPE {show('rpe_trans_cm', 'cm')}, {show('rpe_rot_deg', 'deg')}  "
         f"PSNR {show('psnr_corrected_db', 'dB')} corrected, {show('psnr_db', 'dB')} raw  "
         f"depth L1 {show('depth_l1_cm', 'cm')}\n"
         f"{metrics['num_frames']} frames, {metrics['num_lost_frames']} lost, "
         f"{metrics['num_gaussians']} Gaussians, tracking {show('tracking_hz', 'Hz')}, "
-        f"{metrics['wall_s']:.0f} s in all, {metrics['peak_memory_mb']:.0f} MB"
+        f"{metrics['wall_s']:.0f} s in all, {metrics['peak_memory_mb']:.0f} MB",
     )

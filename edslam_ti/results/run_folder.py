@@ -86,7 +86,14 @@ class RunFolder:
         self.write(STATE, json.dumps(about, indent=2) + "\n")
 
     def finish(self) -> None:
-        """Mark the run as finished: what it could have been resumed from goes."""
+        """Mark the run as finished; once its results are on the disk, its checkpoints go."""
+        for path in (*self.path.glob("*.*"), self.path):
+            if path.is_file() or path == self.path:
+                descriptor = os.open(path, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
         self.set_state(FINISHED)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
