@@ -78,11 +78,9 @@ class Journal:
 
     def _add_corrections(self, trajectory: Trajectory) -> None:
         # A corrected pose is another array: `Trajectory.replace` changes none in place.
-        for k, written in enumerate(self._written):
-            pose = trajectory.pose(k)
-            if pose is not written:
-                self._add_line(trajectory, k, "", "corrected")
-                self._written[k] = pose
+        for k in trajectory.replaced(self._written):
+            self._add_line(trajectory, k, "", "corrected")
+            self._written[k] = trajectory.pose(k)
 
     def _add_line(self, trajectory: Trajectory, index: int, converged: str, message: str) -> None:
         T = trajectory.pose(index)

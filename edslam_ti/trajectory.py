@@ -1,7 +1,9 @@
 """A camera path: key poses over time, interpolated along geodesics (Eq. 9), read and written as TUM."""
 
 import bisect
+import operator
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +47,12 @@ class Trajectory:
     def timestamp(self, index: int) -> float:  # seconds
         """Return the time of key pose `index`; negative counts from the end."""
         return self._timestamps[index]
+
+    def replaced(self, poses: Sequence[np.ndarray]) -> list[int]:
+        """Return which of the first key poses are other arrays than these, which `pose` returned before."""
+        if not any(map(operator.is_not, poses, self._poses)):  # an hour's poses within a millisecond or two
+            return []
+        return [k for k, (old, new) in enumerate(zip(poses, self._poses)) if old is not new]
 
     def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
         """Add a pose later than all others."""
