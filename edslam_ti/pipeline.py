@@ -207,11 +207,11 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
     except Exception as error:
         failure = failure or _told(error, state)
     try:
+        problem = point_latest_to(folder.path)
         if failure is None and not interruption.requested:
             folder.finish()
         else:
             folder.set_state(FAILED if failure is not None else INTERRUPTED)
-        problem = point_latest_to(folder.path)
     except OSError as error:
         failure, problem = failure or error, ""
     if problem:

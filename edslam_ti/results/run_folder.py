@@ -58,6 +58,7 @@ class RunFolder:
         folder = cls(path, _locked(path), [])
         state = read_state(path) or {}
         if state.get("state") == FINISHED:
+            shutil.rmtree(folder.checkpoints, ignore_errors=True)  # it was cut off just before it did so
             folder.close()
             raise DataError(f"{path}: this run has finished; there is nothing to resume")
         folder.identity = state.get("identity") or {}
