@@ -256,6 +256,9 @@ class Config(Stage):
     """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
     out: Path = Path("results")
     """Folder that receives the results."""
+    checkpoint: float = Field(60.0, ge=0)
+    """Seconds between checkpoints, from which `--resume RUN` goes on with a run that was cut off; 0: none.
+    Less often where they would take more than 2 % of the time."""
     visualize: bool = False
     """Follow the run in an Open3D window."""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -37,5 +37,9 @@ class DataError(EdSlamError):
     """A file is missing, unreadable, truncated, or holds values that cannot be right."""
 
 
+class LostTrackError(EdSlamError):
+    """More than a tenth of a run's frames was lost; its results are saved."""
+
+
 class MissingExtraError(EdSlamError, ModuleNotFoundError):
     """An optional package is not installed; the message names the extra that brings it."""

@@ -2,6 +2,8 @@
 
 import bisect
 import logging
+import operator
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 
@@ -53,6 +55,16 @@ class Trajectory:
     def index_of(self, timestamp: float) -> int:
         """Return the index of the last pose at or before a time; -1: there is none."""
         return bisect.bisect_right(self._timestamps, timestamp) - 1
+
+    def timestamp(self, index: int) -> float:  # seconds
+        """Return the time of key pose `index`; negative counts from the end."""
+        return self._timestamps[index]
+
+    def replaced(self, poses: Sequence[np.ndarray]) -> list[int]:
+        """Return which of the first key poses are other arrays than these, which `pose` returned before."""
+        if not any(map(operator.is_not, poses, self._poses)):  # an hour's poses within a millisecond or two
+            return []
+        return [k for k, (old, new) in enumerate(zip(poses, self._poses)) if old is not new]
 
     def append(self, timestamp: float, T_world_camera: np.ndarray) -> None:
         """Add a pose later than all others."""

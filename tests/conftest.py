@@ -21,6 +21,7 @@ DATA = Path(os.environ.get("EDSLAM_DATA") or Path(__file__).parents[2] / "shared
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", choices=("cpu", "cuda"), default="cpu", help="where tests/kernels run")
+    parser.addoption("--kills", type=int, default=3, help="how often tests/test_checkpoint.py kills runs")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -43,6 +44,12 @@ def device(request: pytest.FixtureRequest) -> str:
     """Return where kernels run."""
     chosen: str = request.config.getoption("device")
     return chosen
+
+
+@pytest.fixture(scope="session")
+def kills(request: pytest.FixtureRequest) -> int:
+    """Return how many times runs are killed."""
+    return int(request.config.getoption("kills"))
 
 
 @pytest.fixture(scope="session", autouse=True)

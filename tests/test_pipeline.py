@@ -3,10 +3,12 @@
 import csv
 import io
 import json
+import os
 import re
 import runpy
 import shutil
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.mapping.gaussian_ply import read_gaussian_ply
 from edslam_ti.pipeline import held_out_frames, run
 from edslam_ti.results import folder as results
+from edslam_ti.results.reading import require_tracked
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import read_tum
@@ -37,7 +40,7 @@ FEW = {"iterations": 1, "final_iterations": 10}
 ARTEFACTS = {
     *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "poses.csv", "trajectory.png"),
     *("map.ply", "mesh.ply", "points.ply", "flythrough.mp4"),
-    *("config.yaml", "metrics.json", "log.txt", "renders"),
+    *("config.yaml", "metrics.json", "log.txt", "renders", "journal.csv", "run.json"),
 }
 KEYS = {
     *("dataset", "scene", "method", "ate_rmse_cm", "ate_mean_cm", "ate_rmse_sim3_cm", "rpe_trans_cm"),
@@ -281,13 +284,6 @@ def test_log_says_what_was_run(result: Path) -> None:
     assert lines[-1].endswith("saved")
 
 
-def test_two_results_of_one_second_do_not_meet(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a-2").mkdir()
-    assert results._unused(tmp_path / "a") == tmp_path / "a-3"
-    assert results._unused(tmp_path / "b") == tmp_path / "b"
-
-
 def test_held_out_frames_have_depth_and_are_never_the_first() -> None:
     class Samples:
         has_depth = np.array([True, False, True, True, False, True, True, True])
@@ -444,7 +440,7 @@ def test_interrupt_saves_what_there_is_and_exits_130(
     assert stop.value.code == 130
     assert "saving what there is" in capsys.readouterr().out
     folder = (tmp_path / "event_replica/tiny/ed_slam/latest").resolve()
-    assert {p.name for p in folder.iterdir()} == ARTEFACTS
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS | {"checkpoint"}
     metrics = metrics_of(folder)
     assert metrics["is_interrupted"]
     assert metrics["num_frames"] == 6  # the frame in hand is finished
@@ -474,24 +470,247 @@ def test_interrupt_while_refining_stops_it(
 def test_interrupt_before_the_first_frame_leaves_nothing(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Interrupted(pipeline._Interrupt):
-        requested = True
+    def interrupted(*arguments: Any, **options: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(pipeline, "_Interrupt", Interrupted)
+    monkeypatch.setattr(pipeline, "contrast_of", interrupted)
     with pytest.raises(KeyboardInterrupt):
         quiet_run(config_for(tiny_folder, tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
-def test_failed_saving_leaves_no_half_written_folder(
-    error: BaseException, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+# --- whatever ends a run ---
+
+
+def fail_at(frame: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise an exception when a frame is processed."""
+    process: Callable[..., TrackingResult] = Slam.process
+
+    def processed(self: Slam, sample: Sample, is_held_out: bool = False) -> TrackingResult:
+        if len(self.results) == frame:
+            raise error
+        return process(self, sample, is_held_out)
+
+    monkeypatch.setattr(Slam, "process", processed)
+
+
+def ended(config: Config, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, Path]:
+    """Return the exit code of a run, the one line on stderr, and the folder that `latest` points to."""
+    with pytest.raises(SystemExit) as stop:
+        launch(lambda: require_tracked(run(config)))
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    assert isinstance(stop.value.code, int)
+    return stop.value.code, message, (config.out / "event_replica/tiny/ed_slam/latest").resolve()
+
+
+def state_of(folder: Path) -> str:
+    return json.loads((folder / "run.json").read_text())["state"]
+
+
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("Singular matrix"), DataError("broken"), OSError(28, "No space left")]
+)
+def test_exception_in_the_loop_saves_path_and_map_so_far(
+    error: Exception,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    fail_at(6, error, monkeypatch)
+    code, message, folder = ended(config_for(tiny_folder, tmp_path), capsys)
+    assert code == 1
+    assert str(error).split("] ")[-1] in message
+    assert state_of(folder) == "failed"
+    assert len(read_tum(folder / "trajectory_tum.txt")) == 6
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS
+    if isinstance(error, np.linalg.LinAlgError):
+        assert "fail_at" not in message  # the line is for people, the traceback is in the log
+        assert "Traceback" in (folder / "log.txt").read_text()
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_signals_save_what_there_is(
+    name: str,
+    code: int,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(signal, "getsignal", lambda number: signal.SIG_DFL)  # of a process under nohup, too
+    raise_at(4, getattr(signal, name), monkeypatch)
+    differences: dict[str, Any] = {"mapping": {"enabled": False}}
+    result = ended(config_for(tiny_folder, tmp_path, **differences), capsys)
+    assert result[0] == code
+    assert state_of(result[2]) == "interrupted"
+    assert len(read_tum(result[2] / "trajectory_tum.txt")) == 5
+
+
+@pytest.mark.parametrize("when", ["loop", "saving"])
+def test_second_interrupt_keeps_path_and_map_and_leaves_the_rest(
+    when: str,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(*arguments: Any, **options: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("a signal breaks this off")
+
+    if when == "saving":
+        monkeypatch.setattr(results, "save_views", interrupted)
+    else:
+        raise_at(5, signal.SIGINT, monkeypatch, times=2)
+    code, _, folder = ended(config_for(tiny_folder, tmp_path), capsys)
+    assert code == 130
+    names = {p.name for p in folder.iterdir()}
+    assert {"trajectory_tum.txt", "map.ply", "log.txt", "metrics.json"} <= names
+    assert not {"renders", "mesh.ply", "flythrough.mp4"} & names
+    assert "left out: views: interrupted" in (folder / "log.txt").read_text()
+
+
+def raise_at(frame: int, number: int, monkeypatch: pytest.MonkeyPatch, times: int = 1) -> None:
+    """Send signals to this process while a frame is processed."""
+    process: Callable[..., TrackingResult] = Slam.process
+
+    def processed(self: Slam, sample: Sample, is_held_out: bool = False) -> TrackingResult:
+        for _ in range(times if len(self.results) == frame else 0):
+            signal.raise_signal(number)
+        return process(self, sample, is_held_out)
+
+    monkeypatch.setattr(Slam, "process", processed)
+
+
+@pytest.mark.parametrize("part", ["plot_trajectory", "save_views", "run_metrics"])
+def test_part_that_fails_is_left_out(
+    part: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: Any, **options: Any) -> None:
-        raise error
+        raise DataError("cannot be measured")
 
-    monkeypatch.setattr(results, "write_tum", fail)
-    config = config_for(tiny_folder, tmp_path, duration=0.2, mapping={"enabled": False})
-    with pytest.raises(type(error)):
+    monkeypatch.setattr(results, part, fail)
+    folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.2))
+    assert "cannot be measured" in (folder / "log.txt").read_text()
+    made = {"plot_trajectory": "trajectory.png", "save_views": "renders", "run_metrics": "metrics.json"}
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {made[part]}
+
+
+def test_full_disk_while_saving_keeps_what_fits(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*arguments: Any, **options: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(results, "write_points", fail)
+    code, message, folder = ended(config_for(tiny_folder, tmp_path, duration=0.2), capsys)
+    assert (code, state_of(folder)) == (1, "failed")
+    assert "No space left on device" in message
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"points.ply"}
+
+
+def test_reader_that_goes_away_does_not_end_the_run(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as closed:
+        monkeypatch.setattr(sys, "stdout", closed)
+        folder = run(config_for(tiny_folder, tmp_path, duration=0.3, mapping={"enabled": False}))
+        assert state_of(folder) == "finished"
+
+
+def test_more_than_a_tenth_of_lost_frames_is_exit_code_3(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Neither depth nor events for a quarter of a second.
+    dark = sorted((recording / "depth").iterdir())[8:13]
+    start, end = (int(path.stem[5:]) / 1000 for path in (dark[0], dark[-1]))
+    for path in dark:
+        cv2.imwrite(str(path), np.zeros((80, 120), np.uint16))
+    (events_file,) = recording.glob("event_threshold_*/*.npy")
+    events = np.load(events_file)
+    np.save(events_file, events[(events[:, 2] < start - 0.05) | (events[:, 2] > end)])
+    config = config_for(recording, tmp_path, mapping={"enabled": False})
+    with pytest.raises(SystemExit) as stop:
+        launch(lambda: require_tracked(run(config)))
+    assert stop.value.code == 3
+    assert "5 of 14 frames were lost" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["depth/frame000400.png", "images/frame000400.png"])
+def test_unreadable_image_in_the_middle_is_a_frame_without_it(
+    name: str, recording: Path, tmp_path: Path
+) -> None:
+    path = recording / name
+    path.write_bytes(path.read_bytes()[:300])
+    folder = quiet_run(config_for(recording, tmp_path, mapping={"enabled": False}))
+    assert len(read_tum(folder / "trajectory_tum.txt")) == 14
+    assert path.name in (folder / "log.txt").read_text()
+    assert metrics_of(folder)["num_lost_frames"] == 0
+
+
+def test_many_unreadable_frames_in_a_row_end_the_run(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "MOST_UNREADABLE", 4)
+    for path in sorted((recording / "depth").iterdir())[5:9]:
+        path.write_bytes(path.read_bytes()[:300])
+    config = config_for(recording, tmp_path, mapping={"enabled": False})
+    with pytest.raises(DataError, match="4 frames in a row cannot be read"):
         quiet_run(config)
-    assert list((tmp_path / "event_replica/tiny/ed_slam").iterdir()) == []
+    assert (tmp_path / "event_replica/changed/ed_slam/latest/trajectory_tum.txt").is_file()
+
+
+# --- what shows before the first frame ---
+
+
+def test_missing_lpips_weights_show_before_the_first_frame(tiny_folder: Path, tmp_path: Path) -> None:
+    evaluation = {"lpips_weights": str(tmp_path / "missing.pt")}
+    with pytest.raises(FileNotFoundError, match="LPIPS weights not found"):
+        quiet_run(config_for(tiny_folder, tmp_path / "out", evaluation=evaluation))
+    assert not (tmp_path / "out").exists()
+
+
+def test_place_that_cannot_be_written_shows_before_the_first_frame(
+    tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit) as stop:
+        launch(lambda: print(run(config_for(tiny_folder, tmp_path / "file"))))
+    assert stop.value.code == 1
+    assert "Not a directory" in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_unreadable_novel_views_are_left_out_of_evaluation(recording: Path, tmp_path: Path) -> None:
+    path = sorted((recording / "novel_views" / "images").iterdir())[1]
+    path.write_bytes(path.read_bytes()[:300])
+    folder = quiet_run(config_for(recording, tmp_path, duration=0.3))
+    assert "left out of evaluation" in (folder / "log.txt").read_text()
+    metrics = metrics_of(folder)
+    assert metrics["num_novel_views"] == 0
+    assert metrics["num_held_out_views"] > 0
+
+
+def test_latest_that_is_a_folder_stays(tiny_folder: Path, tmp_path: Path) -> None:
+    latest = tmp_path / "event_replica/tiny/ed_slam/latest"
+    (latest / "mine").mkdir(parents=True)
+    folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.2, mapping={"enabled": False}))
+    assert (latest / "mine").is_dir()
+    assert state_of(folder) == "finished"
+
+
+def test_markup_and_control_characters_in_files_are_shown_as_text(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    (recording / "camera.json").write_text(json.dumps(camera | {"description": "[/x] [red]\x1b]0;title"}))
+    out = tmp_path / "a[red]b"
+    run(config_for(recording, out, duration=0.2, mapping={"enabled": False}))
+    printed = capsys.readouterr().out
+    assert "[/x] [red]\\x1b]0;title" in printed
+    assert "a[red]b" in printed.replace("\n", "")

@@ -19,7 +19,7 @@ class EvaluateOptions(Stage):
     """What to compare."""
 
     estimate: Annotated[Path, Shown("EST.txt", is_positional=True)]
-    """Estimated trajectory, TUM format."""
+    """Estimated trajectory, TUM format; or the journal.csv of a run that was cut off."""
     truth: Annotated[Path, Shown("TRUTH.txt", is_positional=True)]
     """True trajectory, TUM format."""
     mesh: Path | None = None
@@ -37,10 +37,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     from edslam_ti.evaluation.trajectories import statistics, trajectory_errors
     from edslam_ti.evaluation.truth_notes import truth_notes
+    from edslam_ti.journal import read_journal
     from edslam_ti.trajectory import Trajectory, read_tum
 
     notes: list[str] = []
-    estimate, truth = read_tum(options.estimate, notes), read_tum(options.truth, notes)
+    is_journal = options.estimate.suffix == ".csv"
+    estimate = read_journal(options.estimate) if is_journal else read_tum(options.estimate, notes)
+    truth = read_tum(options.truth, notes)
     errors = trajectory_errors(estimate, truth)
     print(f"{errors.num_poses} poses compared over {errors.timestamps[-1] - errors.timestamps[0]:.3f} s")
     tables = {

@@ -3,10 +3,11 @@
 import inspect
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import true_path
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -245,6 +248,27 @@ class SampledSequence:
         # The first sample gets a little history so that its time surface is not empty.
         previous = float(self.timestamps[k - 1]) if k else sample.timestamp - 0.1
         return replace(sample, events=self.sequence.events(previous, sample.timestamp))
+
+    def as_far_as_readable(self, k: int) -> tuple[Sample, str]:
+        """Return sample k without what cannot be read of it, and what that is (nothing: all is there)."""
+        try:
+            return self[k], ""
+        except (DataError, OSError):
+            pass
+        sequence, t, problems = self.sequence, float(self.timestamps[k]), list[str]()
+
+        def read(part: Callable[[], T], otherwise: T) -> T:
+            try:
+                return part()
+            except (DataError, OSError) as error:
+                problems.append(str(error))
+                return otherwise
+
+        start, index = float(self.timestamps[k - 1]) if k else t - 0.1, int(self._depth_index[k])
+        events = read(lambda: sequence.events(start, t), Events.empty())
+        depth = read(lambda: sequence.depth(index) if self.has_depth[k] else None, None)
+        image = read(lambda: sequence.image_at(t), None)
+        return Sample(t, events, depth, image, sequence.true_pose(t)), "; ".join(problems)
 
     def without_events(self, k: int) -> Sample:
         """Return sample k with no events: what it is compared with."""

@@ -29,6 +29,8 @@ class Lpips:
         """Read a torch state dict with `features.N.{weight,bias}` and `linK.model.1.weight`."""
         if not weights.is_file():
             raise FileNotFoundError(f"{weights}: LPIPS weights not found")
+        self._shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
+        self._scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
         try:
             state = torch.load(weights, map_location="cpu", weights_only=True)
             self._convolutions = [
@@ -36,14 +38,13 @@ class Lpips:
                 for k, stride, padding, pool in self.LAYERS
             ]
             self._linear = [state[f"lin{k}.model.1.weight"] for k in range(len(self.LAYERS))]
+            self(np.zeros((64, 64)), np.zeros((64, 64)))  # weights of wrong shapes or kinds show here
         except Exception as error:  # torch.load raises whatever unpickling does
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise DataError(
                 f"{weights}: expected LPIPS weights (a torch state dict with features.N.weight, "
                 f"features.N.bias and linK.model.1.weight); {reason}"
             ) from error
-        self._shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
-        self._scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 
     @torch.no_grad()
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:

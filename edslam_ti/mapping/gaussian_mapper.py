@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,17 @@ MAX_RECOLOURED = 8  # frames looked at for the brightness that such a solution g
 SETTLING = (0.002, 0.1)  # metres, degrees: poses that change by less are only being refined
 
 
+@dataclass
+class Refinement:
+    """How far the final steps are."""
+
+    allowed: float  # seconds of the budget when they began
+    densifier: Densifier | None
+    is_aligned: bool  # frames without depth need no alignment to the map any more
+    num_steps: int = 0
+    done: float = 0.0  # share of the final steps, or of the budget
+
+
 class GaussianMapper:
     """Gaussians from depth, optimised with the poses for what events say has changed since the beginning.
 
@@ -69,6 +81,7 @@ class GaussianMapper:
         self._refiner = PoseRefiner(config.mapping.poses_rate)
         self._aligner = MapAligner(camera, config.tracking, config.mapping)
         self._built_on = PoseMemory()
+        self._refinement: Refinement | None = None  # None: not refining
         self._num_frames = 0
         self._num_supervised = 0  # frames that the map has been optimised for, dropped ones too
 
@@ -93,12 +106,26 @@ class GaussianMapper:
         self.budget.stop()
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
-        """Refine map and poses over everything kept, with falling learning rates."""
+        """Refine map and poses over everything kept, with falling learning rates.
+
+        A mapper restored from its state in mid refinement goes on with the next step.
+        """
         self.budget.start()
-        if len(self.gaussians) > 0 and self._solve_brightness(trajectory, is_thorough=True):
-            self._optimise_finally(trajectory, progress)
+        if self._refinement is None:
+            self._refinement = self._begin_refinement(trajectory)
+        if self._refinement is not None:
+            self._optimise_finally(self._refinement, trajectory, progress)
             prune_faded(self.gaussians, self._config.min_opacity)
+        self._refinement = None
         self.budget.stop()
+
+    def _begin_refinement(self, trajectory: Trajectory) -> Refinement | None:
+        """Solve all start images; return where the final steps begin, None where nothing can be refined."""
+        if len(self.gaussians) == 0 or not self._solve_brightness(trajectory, is_thorough=True):
+            return None
+        allowed = self.budget.left()
+        densifier = self._densifier(trajectory) if self._config.densify else None
+        return Refinement(allowed, densifier, is_aligned=not self._adjusts_poses)
 
     def _optimise_online(self, trajectory: Trajectory) -> None:
         """Solve the start image now and then, and take a few steps, half of them on the newest frames."""
@@ -118,30 +145,28 @@ class GaussianMapper:
         self.images.drop_surplus(keep={k.index for k in self.keyframes})
         prune_faded(self.gaussians, self._config.min_opacity)
 
-    def _optimise_finally(self, trajectory: Trajectory, progress: Progress) -> None:
+    def _optimise_finally(self, state: Refinement, trajectory: Trajectory, progress: Progress) -> None:
         """Take the final steps: the map first, then poses with it, and once those of frames without depth."""
-        allowed, done, is_aligned = self.budget.left(), 0.0, not self._adjusts_poses
-        densifier = self._densifier(trajectory) if self._config.densify else None
-        for k in range(self._config.final_iterations):
-            if done >= 1:
-                break
-            rate = LAST_RATE**done
+        while state.num_steps < self._config.final_iterations and state.done < 1:
+            rate = LAST_RATE**state.done
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
-            if not is_aligned and done >= ALIGN_FROM:
+            if not state.is_aligned and state.done >= ALIGN_FROM:
                 self._aligner.align(trajectory, self.images, self.gaussians)
-                is_aligned = True
-            adjusts_poses = self._adjusts_poses and done >= ADJUST_FROM
+                state.is_aligned = True
+            adjusts_poses = self._adjusts_poses and state.done >= ADJUST_FROM
             index = self._sampler.any(self.images.frames)
-            difference = self._optimise(index, trajectory, adjusts_poses, densifier)
+            difference = self._optimise(index, trajectory, adjusts_poses, state.densifier)
             if difference is not None:
                 self.images.learn_detail_from_render(index, difference)
-            if densifier is not None:
-                self._densify(densifier, k + 1)
-            done = (k + 1) / self._config.final_iterations
-            if allowed < math.inf:
-                done = max(done, 1 - self.budget.left() / allowed) if allowed > 0 else 1.0
-            if not progress(min(done, 1.0)):
+            state.num_steps += 1
+            if state.densifier is not None:
+                self._densify(state.densifier, state.num_steps)
+            state.done = state.num_steps / self._config.final_iterations
+            if state.allowed < math.inf:
+                left = self.budget.left() / state.allowed if state.allowed > 0 else 0.0
+                state.done = max(state.done, 1 - left)
+            if not progress(min(state.done, 1.0)):
                 break
 
     # --- what the map shows ---

@@ -1,98 +1,175 @@
-"""The results folder of a run: trajectory, map, pictures and numbers, written whole or not at all."""
+"""The results of a run in its folder: path, map, pictures and numbers, each file whole or not at all."""
 
 import json
-import os
 import time
-from collections.abc import Iterator
-from datetime import datetime
+import traceback
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
+from rich.text import Text
 
 from edslam_ti.depth_images import without_depth_edges
+from edslam_ti.errors import LONGEST_MESSAGE, EdSlamError, plain
 from edslam_ti.evaluation.images import LinearFit
+from edslam_ti.interruption import Interruption, Stopped
 from edslam_ti.mapping.mapper import Mapper
-from edslam_ti.output import atomic_folder
+from edslam_ti.output import atomic_file
+from edslam_ti.patient_console import say
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_of
 from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
 from edslam_ti.results.run import Run
 from edslam_ti.results.trust import Trust
-from edslam_ti.results.views import save_views
+from edslam_ti.results.views import KINDS, ViewNumbers, save_views
 from edslam_ti.trajectory import write_tum
 
 MESH_VOXEL = 0.02  # metres
 MESH_ALPHA = 0.5  # pixels less opaque, which have no median depth, are left out of the mesh
 MESH_STEP, MESH_TURN = 0.1, 5.0  # metres, degrees between the views that are fused
 VIDEO_FPS = 15.0
+# An input that is missing or cannot be used, or numbers without a solution: the others stand.
+MISSING = (EdSlamError, FileNotFoundError, np.linalg.LinAlgError)
+NO_VIEWS = {kind: ViewNumbers(0, None, None, None) for kind in KINDS}
+
+T = TypeVar("T")
 
 
-def save(run: Run, console: Console) -> Path:
-    """Write the results folder, whole or not at all, point `latest` to it, and return it."""
-    config, slam = run.config, run.slam
-    parent = config.out / run.sequence.dataset / run.sequence.scene / config.method
-    folder = _unused(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+def save(run: Run, folder: Path, console: Console, interruption: Interruption) -> Metrics | None:
+    """Write the results into a run's folder, the path and the map first; return the metrics.
+
+    Parts that fail are noted and left out. Where the cause is no input's fault, such as a full disk, its
+    exception is raised when everything else is written. None: the metrics were left out.
+    """
+    slam, mapper = run.slam, run.slam.mapper
+    parts = Parts(run, interruption)
     started = time.perf_counter()
-    truth, trust = run.true_trajectory(), Trust.of(slam)
-    slice_s = slice_of(run, truth)
-    with console.status("saving"), atomic_folder(folder) as partial:
+    with console.status("saving"), interruption.saving():
         offset = run.sequence.time_offset  # files carry the recording's own stamps
-        write_tum(slam.trajectory, partial / "trajectory_tum.txt", offset)
-        write_tum(slam.frontend_trajectory, partial / "trajectory_frontend_tum.txt", offset)
+        paths = {
+            "trajectory_tum.txt": slam.trajectory,
+            "trajectory_frontend_tum.txt": slam.frontend_trajectory,
+        }
+        for name, path in paths.items():
+            parts.write("trajectory", partial(write_tum, path, folder / name, offset))
+        has_map = mapper is not None and parts.write("map", lambda: _save_map(run, folder)) is True
+        parts.write("log", lambda: _write_log(run, folder))
+        truth = parts.add("truth", run.true_trajectory)
         if truth is not None:
-            write_tum(truth, partial / "truth_tum.txt", offset)
-        run.attempt("poses.csv", lambda: trust.write(partial / "poses.csv", offset), otherwise=None)
-        (partial / "config.yaml").write_text(config.to_yaml())
-        _write_log(run, partial)
-        views = save_views(run, truth, slice_s, partial / "renders")
-        mesh = _save_map(run, views["held out"].fit, partial)
-        metrics = run_metrics(run, truth, slice_s, views, mesh, trust)
-        _draw_trajectory(run, trust, partial / "trajectory.png")
-        metrics |= cost_metrics(run, saving_seconds=time.perf_counter() - started)
-        (partial / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        for line in (*metrics["truth_notes"], *metrics["problems"]):
-            run.note(line)
-        run.note("seconds per frame: " + _listed(metrics["seconds_per_frame"]))
-        run.note("saved")
-        _write_log(run, partial)
-    _point_latest_to(folder)
-    _print_summary(metrics, run.left_out, console)
-    return folder
+            parts.add("truth", lambda: write_tum(truth, folder / "truth_tum.txt", offset))
+        trust = parts.write("check of the data", lambda: Trust.of(slam)) or Trust.unknown(slam)
+        parts.add("poses.csv", lambda: trust.write(folder / "poses.csv", offset))
+        parts.add("picture of the path", lambda: _draw_trajectory(run, trust, folder / "trajectory.png"))
+        slice_s = parts.add("slice", lambda: slice_of(run, truth))
+        views = parts.add("views", lambda: save_views(run, truth, slice_s, folder / "renders")) or NO_VIEWS
+        mesh = None
+        if has_map and mapper is not None:
+            parts.add("points", lambda: write_points(folder / "points.ply", *mapper.points()))
+            mesh = parts.add("mesh", lambda: _write_mesh(run, mapper, folder / "mesh.ply"))
+            fit, video = views["held out"].fit, folder / "flythrough.mp4"
+            parts.add("fly-through", lambda: _write_fly_through(run, mapper, fit, video))
+        metrics = parts.add("metrics", lambda: run_metrics(run, truth, slice_s, views, mesh, trust))
+        if metrics is None:  # without the mesh and the path, which could not be measured
+            metrics = parts.add(
+                "metrics of the path", lambda: run_metrics(run, truth, slice_s, views, None, trust)
+            )
+        if metrics is None:
+            metrics = parts.write("metrics", lambda: run_metrics(run, None, None, NO_VIEWS, None, trust))
+        if metrics is not None:
+            numbers = metrics | cost_metrics(run, saving_seconds=time.perf_counter() - started)
+            text = json.dumps(numbers, indent=2) + "\n"
+            parts.write("metrics", lambda: _write_text(folder / "metrics.json", text))
+            for line in (*numbers["data_notes"], *numbers["problems"], *numbers["truth_notes"]):
+                run.note_once(line)
+            run.note("seconds per frame: " + _listed(numbers["seconds_per_frame"]))
+            metrics = numbers
+        run.note("saved" if parts.error is None else f"not all could be saved: {parts.error}")
+        parts.write("log", lambda: _write_log(run, folder))
+    for line in (*parts.left_out, *run.left_out):
+        say(console, line)
+    if parts.error is not None:
+        raise parts.error
+    if metrics is not None:
+        _print_summary(metrics, console)
+    return metrics
+
+
+class Parts:
+    """Makes a results folder part by part: one that fails is noted, and the others stand."""
+
+    def __init__(self, run: Run, interruption: Interruption) -> None:
+        self.error: Exception | None = None  # the first that is no input's fault
+        self.left_out: list[str] = []  # a line each
+        self._run = run
+        self._interruption = interruption
+
+    def write(self, what: str, action: Callable[[], T]) -> T | None:
+        """Return what an action returns, None where it fails; for what must be saved whatever happens."""
+        try:
+            return action()
+        except MISSING as error:
+            self._note(what, str(error))
+        except Exception as error:
+            self._note(what, _reason(error))
+            self.error = self.error or error
+        return None
+
+    def add(self, what: str, action: Callable[[], T]) -> T | None:
+        """Return what an action returns, None where it fails; a signal breaks it off, and it is left out."""
+        if self._interruption.is_urgent:
+            self._note(what, "interrupted")
+            return None
+        try:
+            with self._interruption.breakable():
+                return self.write(what, action)
+        except Stopped:
+            self._note(what, "interrupted")
+            return None
+
+    def _note(self, what: str, reason: str) -> None:
+        line = plain(f"left out: {what}: {reason}", LONGEST_MESSAGE)
+        self._run.note(line)
+        self.left_out.append(line)
+
+
+def _reason(error: Exception) -> str:
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
 
 
 def _write_log(run: Run, folder: Path) -> None:
-    (folder / "log.txt").write_text("\n".join(run.messages) + "\n")
+    lines = [plain(message, LONGEST_MESSAGE) for message in run.messages]
+    _write_text(folder / "log.txt", "\n".join(lines) + "\n")
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _draw_trajectory(run: Run, trust: Trust, path: Path) -> None:
-    estimates = {run.config.method: run.slam.trajectory}
-    sigmas = trust.sigmas[0] if trust.is_measured else None
-    run.attempt(
-        path.name, lambda: plot_trajectory(path, estimates, run.sequence.truth, sigmas), otherwise=None
-    )
+    paths = {run.config.method: run.slam.trajectory}
+    plot_trajectory(path, paths, run.sequence.truth, trust.sigmas[0] if trust.is_measured else None)
 
 
 # --- the map ---
 
 
-def _save_map(run: Run, fit: LinearFit | None, folder: Path) -> Any | None:
-    """Write the map's files, points, mesh and fly-through; return the mesh, None where there is none."""
+def _save_map(run: Run, folder: Path) -> bool:
+    """Write the map's own files; return whether there is anything in it."""
     mapper = run.slam.mapper
     if mapper is None:
-        return None
-    points, brightness = mapper.points()
+        return False
+    points, _ = mapper.points()
     if len(points) == 0:
         run.note("the map is empty: no map.ply, points.ply, mesh.ply, flythrough.mp4")
-        return None
-    run.attempt("map.ply", lambda: mapper.save(folder), otherwise=None)
-    points_file = folder / "points.ply"
-    run.attempt("points.ply", lambda: write_points(points_file, points, brightness), otherwise=None)
-    mesh = _write_mesh(run, mapper, folder / "mesh.ply")
-    _write_fly_through(run, mapper, fit, folder / "flythrough.mp4")
-    return mesh
+        return False
+    mapper.save(folder)
+    return True
 
 
 def _write_mesh(run: Run, mapper: Mapper, path: Path) -> Any | None:
@@ -104,12 +181,9 @@ def _write_mesh(run: Run, mapper: Mapper, path: Path) -> Any | None:
             opaque = np.where(view.alpha > MESH_ALPHA, view.depth, 0)
             yield without_depth_edges(opaque), view.intensity, T
 
-    def made() -> Any:
-        mesh = fuse_mesh(views(), run.sequence.camera, MESH_VOXEL)
-        write_mesh(path, mesh)
-        return mesh
-
-    return run.attempt(path.name, made, otherwise=None)  # a map too thin has no surface
+    mesh = fuse_mesh(views(), run.sequence.camera, MESH_VOXEL)
+    write_mesh(path, mesh)  # a map too thin for a surface is an error: the other results stand
+    return mesh
 
 
 def _write_fly_through(run: Run, mapper: Mapper, fit: LinearFit | None, path: Path) -> None:
@@ -120,34 +194,14 @@ def _write_fly_through(run: Run, mapper: Mapper, fit: LinearFit | None, path: Pa
             view = mapper.render(run.sequence.camera, T)
             yield view.intensity if fit is None else fit(view.intensity), view.depth
 
-    frames = fly_through_frames(views())
-    run.attempt(path.name, lambda: write_video(path, frames, VIDEO_FPS), otherwise=None)
-
-
-# --- the folder ---
-
-
-def _unused(folder: Path) -> Path:
-    """Return the folder's name, numbered if two runs end in the same second."""
-    candidate, k = folder, 2
-    while candidate.exists():
-        candidate, k = folder.with_name(f"{folder.name}-{k}"), k + 1
-    return candidate
-
-
-def _point_latest_to(folder: Path) -> None:
-    link = folder.parent / "latest"
-    temporary = folder.parent / f".latest.{os.getpid()}"
-    temporary.unlink(missing_ok=True)
-    temporary.symlink_to(folder.name, target_is_directory=True)
-    os.replace(temporary, link)
+    write_video(path, fly_through_frames(views()), VIDEO_FPS)
 
 
 def _listed(values: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
-def _print_summary(metrics: Metrics, left_out: list[str], console: Console) -> None:
+def _print_summary(metrics: Metrics, console: Console) -> None:
     def show(name: str, unit: str) -> str:
         value = metrics.get(name)
         return "-" if value is None else f"{value:.2f} {unit}"
@@ -156,19 +210,19 @@ def _print_summary(metrics: Metrics, left_out: list[str], console: Console) -> N
     of_scale = "" if scale is None else f" (Sim(3) {show('ate_rmse_sim3_cm', 'cm')}, scale {scale:.4f})"
     of_truth = of_sigma = ""
     if metrics["sigma_position_end_cm"] is not None:
-        of_sigma = (
-            f"sigma {show('sigma_position_median_cm', 'cm')} (end {show('sigma_position_end_cm', 'cm')}), "
-        )
+        at_end = show("sigma_position_end_cm", "cm")
+        of_sigma = f"sigma {show('sigma_position_median_cm', 'cm')} (end {at_end}), "
     if coverage is not None:
         of_truth = f"{metrics['num_truth_poses_compared']} compared with truth ({100 * coverage:.0f} %), "
-    console.print(
+    say(
+        console,
         f"ATE {show('ate_rmse_cm', 'cm')}{of_scale}  RPE {show('rpe_trans_cm', 'cm')}, "
         f"{show('rpe_rot_deg', 'deg')}  "
         f"PSNR {show('psnr_corrected_db', 'dB')} corrected, {show('psnr_db', 'dB')} raw  "
         f"depth L1 {show('depth_l1_cm', 'cm')}\n"
         f"{metrics['num_frames']} frames, {metrics['num_lost_frames']} lost, {of_sigma}{of_truth}"
         f"{metrics['num_gaussians']} Gaussians, tracking {show('tracking_hz', 'Hz')}, "
-        f"{metrics['wall_s']:.0f} s in all, {metrics['peak_memory_mb']:.0f} MB"
+        f"{metrics['wall_s']:.0f} s in all, {metrics['peak_memory_mb']:.0f} MB",
     )
-    for line in (*metrics["data_notes"], *metrics["problems"], *metrics["truth_notes"], *left_out):
-        console.print(line, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    for line in (*metrics["data_notes"], *metrics["problems"], *metrics["truth_notes"]):
+        console.print(Text(plain(line), "yellow"), soft_wrap=True, highlight=False)

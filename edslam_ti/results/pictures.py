@@ -208,5 +208,7 @@ def _drawn(figure: "Figure") -> np.ndarray:  # [H, W, 3] uint8
 
 def _write_png(path: Path, rgb: np.ndarray) -> None:  # [H, W, 3] uint8
     with atomic_file(path) as temporary:
-        if not cv2.imwrite(str(temporary), np.ascontiguousarray(rgb[..., ::-1])):
-            raise DataError(f"{path}: could not be written; is the disk full?")
+        is_done, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
+        if not is_done:
+            raise DataError(f"{path}: could not be encoded")
+        temporary.write_bytes(data.tobytes())  # OpenCV would say why it cannot write to the terminal only

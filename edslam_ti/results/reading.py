@@ -7,9 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from edslam_ti.errors import DataError
+from edslam_ti.errors import DataError, LostTrackError
+from edslam_ti.journal import JOURNAL, read_journal
 from edslam_ti.mesh_reading import read_point_cloud, read_triangle_mesh
+from edslam_ti.results.run_folder import is_unfinished
 from edslam_ti.trajectory import Trajectory, read_tum
+
+MOST_LOST = 0.1  # of the frames; beyond, a run's exit code says that its path is not to be trusted
 
 
 @dataclass(frozen=True)
@@ -30,23 +34,23 @@ class Result:
         words = [str(self.metrics[key]) for key in ("scene", "method") if self.metrics.get(key)]
         ate = self.metrics.get("ate_rmse_cm")
         name = " ".join(words) or self.folder.name
+        name += " (unfinished)" if is_unfinished(self.folder) else ""
         return name if ate is None else f"{name}: ATE {ate:.2f} cm rmse"
 
 
 def load_result(folder: Path) -> Result:
-    """Read a results folder; it must hold `trajectory_tum.txt`, all else is optional."""
+    """Read a results folder; it must hold `trajectory_tum.txt`, all else is optional.
+
+    Of a run that was cut off, the path is read from its journal.
+    """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: results folder not found")
-    trajectory_path = folder / "trajectory_tum.txt"
-    if not trajectory_path.is_file():
+    trajectory_path, journal_path = folder / "trajectory_tum.txt", folder / JOURNAL
+    if not trajectory_path.is_file() and not journal_path.is_file():
         raise DataError(
             f"{folder}: not a results folder (no trajectory_tum.txt); give one that `edslam slam` made"
         )
-    truth_path, metrics_path = folder / "truth_tum.txt", folder / "metrics.json"
-    try:
-        metrics = json.loads(metrics_path.read_text()) if metrics_path.is_file() else {}
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{metrics_path}: not readable as JSON ({error})") from error
+    truth_path, metrics = folder / "truth_tum.txt", _read_metrics(folder)
     points = brightness = mesh = None
     if (folder / "points.ply").is_file():
         cloud = read_point_cloud(folder / "points.ply")
@@ -56,10 +60,29 @@ def load_result(folder: Path) -> Result:
         mesh = read_triangle_mesh(folder / "mesh.ply")
     return Result(
         folder=folder,
-        trajectory=read_tum(trajectory_path),
+        trajectory=read_tum(trajectory_path) if trajectory_path.is_file() else read_journal(journal_path),
         truth=read_tum(truth_path) if truth_path.is_file() else None,
         metrics=metrics,
         points=points,
         brightness=brightness,
         mesh=mesh,
     )
+
+
+def require_tracked(folder: Path) -> None:
+    """Raise `LostTrackError` where more than a tenth of a run's frames was lost."""
+    metrics = _read_metrics(folder)
+    lost, frames = metrics.get("num_lost_frames", 0), metrics.get("num_frames", 0)
+    if lost > MOST_LOST * frames:
+        raise LostTrackError(
+            f"{lost} of {frames} frames were lost; log.txt says why. What there is has been saved to {folder}"
+        )
+
+
+def _read_metrics(folder: Path) -> dict[str, Any]:
+    path = folder / "metrics.json"
+    try:
+        metrics: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not readable as JSON ({error})") from error
+    return metrics

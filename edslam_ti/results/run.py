@@ -29,6 +29,7 @@ class Run:
     contrast: ContrastThreshold
     num_events: int = 0
     finish_seconds: float = 0.0
+    is_refined: bool = False  # the map's final steps are done
     is_interrupted: bool = False
     started: float = field(default_factory=time.perf_counter)
     messages: list[str] = field(default_factory=list)
@@ -49,10 +50,15 @@ class Run:
     def leave_out(self, part: str, error: Exception) -> None:
         """Note that a part of the results is missing, and why, once."""
         reason = " ".join(str(error).split()) or type(error).__name__
-        line = f"{part} left out: {reason[:MOST_CHARACTERS]}"
+        line = f"left out: {part}: {reason[:MOST_CHARACTERS]}"
         if line not in self.left_out:
             self.left_out.append(line)
             self.note(line)
+
+    def note_once(self, message: str) -> None:
+        """Add a line to the log unless it is there."""
+        if not any(line.endswith(message) for line in self.messages):
+            self.note(message)
 
     def true_trajectory(self) -> Trajectory | None:
         """Return the truth at those tracked times at which it is known; None where there is none.

@@ -37,6 +37,11 @@ class Trust:
         """Return it for a run."""
         return Trust(slam.trajectory, slam.results, slam.tracker.consistency(slam.trajectory))
 
+    @staticmethod
+    def unknown(slam: Slam) -> "Trust":
+        """Return it for a run whose data could not be compared."""
+        return Trust(slam.trajectory, slam.results, None)
+
     @cached_property
     def sigmas(self) -> tuple[np.ndarray, np.ndarray]:  # [F] metres, [F] degrees
         """Standard deviations of every pose's position and rotation, about the first pose."""

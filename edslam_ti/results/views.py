@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from edslam_ti.errors import DataError
 from edslam_ti.evaluation.images import (
     ImageMetrics,
     LinearFit,
@@ -129,7 +130,10 @@ def _novel_views(run: Run, mapper: Mapper, truth: Trajectory | None, most: int) 
         return
     trajectory, camera = run.slam.trajectory, run.sequence.camera
     start, end = trajectory.timestamps[[0, -1]]
-    novel = [v for v in run.sequence.novel_views() if start <= v.timestamp <= end]
+    try:
+        novel = [v for v in run.sequence.novel_views() if start <= v.timestamp <= end]
+    except (DataError, OSError):
+        return  # said before the first frame
     surfaces = run.sequence.surfaces_file
     seen_from = TrueSurfaces(surfaces).views(camera, viewpoints(truth)) if surfaces else None
     T_estimate_truth = np.linalg.inv(align_views(trajectory.resampled(truth.timestamps).poses, truth.poses))

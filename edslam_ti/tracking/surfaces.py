@@ -1,6 +1,6 @@
 """Frames with a time surface (Eq. 1) and an image pyramid, for alignment of patches."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -10,6 +10,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig
 from edslam_ti.depth_images import downscaled, downscaled_depth
 from edslam_ti.event_images.noisy import NoisyPixels
+from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 from edslam_ti.kernels.time_surface import time_surface, update_last_timestamps
 
@@ -62,7 +63,7 @@ class SurfaceFrameBuilder:
         surface = self.noisy_pixels.replaced(surface)
         if self._config.blur > 0:
             surface = cv2.GaussianBlur(surface, (0, 0), self._config.blur)
-        return SurfaceFrame(frame, surface)
+        return SurfaceFrame(replace(frame, events=Events.empty()), surface)  # they are in the surface
 
     def reset(self) -> None:
         """Forget all events."""
