@@ -1,4 +1,4 @@
-"""From the command line to validated settings, and from errors to one line and an exit code.
+"""Turns the command line into validated settings, and errors into one line and an exit code.
 
 Settings come from, each overriding the one before: defaults, configs/<dataset>.yaml, the method's preset,
 --config FILE, flags. Every field of `Config` is a flag, `--stage.field VALUE` for nested ones.
@@ -17,7 +17,7 @@ from edslam_ti.config import CONFIGS, Config, dataset_differences, merged, read_
 from edslam_ti.errors import ConfigError, EdSlamError
 from edslam_ti.methods import METHODS
 
-FAILED, USAGE, INTERRUPTED = 1, 2, 130  # exit codes; 130 is the shell's for Ctrl-C
+FAILED, USAGE, INTERRUPTED = 1, 2, 130  # exit codes; shells use 130 for Ctrl-C
 
 
 class _RunOptions(Config):
@@ -30,9 +30,9 @@ class _RunOptions(Config):
 def read_choices(
     argv: Sequence[str] | None = None, description: str | None = None, program: str = "edslam slam"
 ) -> tuple[Config, dict[str, Any]]:
-    """Return defaults with what --config FILE and the flags change, and these changes; nothing heavy loads.
+    """Return the defaults changed by --config FILE and the flags, and these changes; loads no heavy library.
 
-    `with_presets` puts what the data set and the method need below them.
+    `with_presets` adds the presets of the data set and the method, which these changes override.
     """
     notes = {"method": [f"{name}: {method.description}" for name, method in METHODS.items()]}
     given = read_given(_RunOptions, argv, program, description, notes)
@@ -48,7 +48,7 @@ def read_choices(
 def with_presets(choices: Config, differences: dict[str, Any], configs: Path = CONFIGS) -> Config:
     """Return a run's settings; `configs` is the folder of <dataset>.yaml files.
 
-    Without --dataset the data folder is looked at to find the format, which loads torch.
+    Without --dataset it detects the format from the data folder, which loads torch.
     """
     dataset = choices.dataset
     if dataset is None:
@@ -63,19 +63,19 @@ def with_presets(choices: Config, differences: dict[str, Any], configs: Path = C
 def parse_config(
     argv: Sequence[str] | None = None, configs: Path = CONFIGS, description: str | None = None
 ) -> Config:
-    """Return the settings that the command line asks for; `configs` is the folder of <dataset>.yaml files."""
+    """Return the settings of the command line; `configs` is the folder of <dataset>.yaml files."""
     return with_presets(*read_choices(argv, description), configs)
 
 
 def launch(main: Callable[[], None]) -> None:
-    """Run a command: what a user can mend ends in one line on stderr and an exit code, not in a traceback."""
+    """Run a command; errors that a user can fix print one line on stderr and no traceback."""
     try:
         main()
     except UsageError as error:
         _exit(USAGE, f"{error} (--help lists the options)")
     except EdSlamError as error:
         _exit(FAILED, str(error))
-    except BrokenPipeError:  # the reader of our output is gone, as in `| head`
+    except BrokenPipeError:  # the reader of the output has ended, as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
     except OSError as error:

@@ -1,6 +1,6 @@
-"""Outputs that appear whole or not at all: written under a temporary name, then renamed.
+"""Atomic outputs: files and folders are written under a temporary name, then renamed.
 
-And the header of a .npy file whose number of rows is known only after the last one.
+Also the header of a .npy file whose number of rows is known only at the end.
 """
 
 import os
@@ -16,7 +16,7 @@ import numpy as np
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` (same suffix); rename it to `path` when the block ends well."""
+    """Yield a temporary path next to `path` (same suffix); rename it to `path` if the block succeeds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}.partial{path.suffix}")
     try:
@@ -28,9 +28,9 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; rename it to `path` when the block ends well.
+    """Yield a temporary folder next to `path`; rename it to `path` if the block succeeds.
 
-    An existing folder at `path` is replaced; on an exception it stays as it was.
+    An existing folder at `path` is replaced; on an exception it stays unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
@@ -51,8 +51,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def write_npy_header(file: BinaryIO, dtype: np.dtype, num_rows: int, num_columns: int) -> None:
     """Write the header of an array [num_rows, num_columns] at the start of a .npy file.
 
-    Rows are appended behind it. NumPy pads the header so that a later call with their true number takes
-    the same space.
+    Append rows after it. NumPy pads the header, so a later call with the true number of rows takes the same
+    space.
     """
     file.seek(0)
     header = {"descr": dtype.str, "fortran_order": False, "shape": (num_rows, num_columns)}
