@@ -36,7 +36,7 @@ class Lpips:
                 for k, stride, padding, pool in self.LAYERS
             ]
             self._linear = [state[f"lin{k}.model.1.weight"] for k in range(len(self.LAYERS))]
-        except Exception as error:  # torch.load raises whatever unpickling does
+        except Exception as error:  # torch.load raises any exception of unpickling
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise DataError(
                 f"{weights}: expected LPIPS weights (a torch state dict with features.N.weight, "
