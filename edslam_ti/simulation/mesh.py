@@ -1,7 +1,7 @@
-"""Textured or vertex-coloured meshes (obj, ply, glb, ...) as scenes, read through Open3D.
+"""Loads textured or vertex-coloured meshes (obj, ply, glb, ...) as scenes with Open3D.
 
-Brightness is the file's colour (base colour x texture x vertex colour) as it is: scanned meshes such as
-Replica's carry their light in the colours. Axes are the file's (glTF: y up; many scans: z up).
+Brightness is the file's colour (base colour x texture x vertex colour) without shading, because colours of
+scanned meshes such as Replica's contain the light. Axes are the file's (glTF: y up; many scans: z up).
 """
 
 from pathlib import Path
@@ -95,7 +95,7 @@ class _Part:
             self.image = _grey(np.asarray(image))
             height, width = self.image.shape
             uv = np.asarray(mesh.triangle_uvs).reshape(count, 3, 2)
-            # v points up in files (Open3D turns glTF's, which points down).
+            # v points up in files (Open3D flips glTF's, which points down).
             self.coordinates = np.stack([uv[..., 0] * width, (1 - uv[..., 1]) * height], -1)
             self.coloured = True
         if mesh.has_vertex_colors():
@@ -118,7 +118,7 @@ def _grey(image: np.ndarray) -> np.ndarray:  # [H, W] float32 in [0, 1]
 
 
 def _check_obj_textures(path: Path) -> None:
-    """Raise when a material library or a texture that an obj names is missing: Open3D only warns."""
+    """Raise if a material library or a texture named in an obj file is missing; Open3D only warns."""
     libraries = _values(path, "mtllib")
     for library in libraries:
         file = path.parent / library
@@ -131,7 +131,7 @@ def _check_obj_textures(path: Path) -> None:
 
 
 def _values(path: Path, keyword: str) -> list[str]:
-    """Return what follows a keyword at the start of a line."""
+    """Return the rest of every line that starts with a keyword."""
     found = []
     with path.open(errors="replace") as file:
         for line in file:

@@ -7,7 +7,7 @@ from pydantic import Field, ValidationError
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError
 
-if TYPE_CHECKING:  # it loads numpy, which options need not wait for
+if TYPE_CHECKING:  # reading options must not load numpy
     from edslam_ti.camera import Camera
 
 
@@ -29,7 +29,7 @@ class SimulationConfig(Stage):
     threshold_noise: float = Field(0.0, ge=0)
     """Standard deviation of the threshold of each event (ESIM: 0.021)."""
     refractory_period: float = Field(0.0, ge=0, lt=1)
-    """Seconds after an event in which its pixel stays silent."""
+    """Refractory period: seconds after an event in which its pixel fires no other."""
     log_epsilon: float = Field(1 / 255, gt=0)
     """Added to the grey value in [0, 1] before the logarithm."""
     depth_rate: float = Field(20.0, gt=0, le=1000)
@@ -41,7 +41,7 @@ class SimulationConfig(Stage):
     exposure: float = Field(0.0, ge=0, lt=1)
     """Seconds over which an image integrates, centred on its time (motion blur); 0: sharp."""
     samples_per_pixel: int = Field(6, ge=1, le=64)
-    """Rays of a pixel that shows an edge; others take one ray and a texture look-up filtered to its size."""
+    """Rays per pixel at an edge; other pixels take one ray and a texture look-up filtered to their size."""
     max_motion: float = Field(1.0, gt=0, le=8)
     """Pixels a scene point may move between rendered frames; in between, log intensity is linear."""
     min_frame_rate: float = Field(100.0, gt=0)
@@ -49,21 +49,21 @@ class SimulationConfig(Stage):
     speed: float = Field(1.0, gt=0, le=10)
     """Factor on the speed of the built-in path (1: about 0.4 m/s)."""
     path: Literal["hand_held", "rotation", "stop_and_go", "loop"] = "hand_held"
-    """rotation: the camera turns on the spot; stop_and_go: it stands still for 0.6 s of every 1.6 s;
-    loop: it turns once around (every 30 s or so) and ends where it began."""
+    """rotation: the camera only rotates; stop_and_go: it stands still for 0.6 s of every 1.6 s; loop: it
+    makes a full turn (about every 30 s) and ends where it began."""
     pose_rate: float | None = Field(None, gt=0, le=1000)
     """Written true poses per second, milliseconds as for images; omitted: one per image."""
     event_gap: tuple[float, float] | None = None
-    """Start and length in seconds of a stretch whose events are lost."""
+    """Start and length in seconds of an interval whose events are lost."""
     depth_gap: tuple[float, float] | None = None
-    """Start and length in seconds of a stretch whose depth images are lost."""
+    """Start and length in seconds of an interval whose depth images are lost."""
     compact_events: bool = False
-    """Events as float32: half the disk space; stamps are exact to 0.3 us up to 4 s, 4 us up to a minute."""
+    """Write events as float32, in half the space; stamps are exact to 0.3 us up to 4 s, 4 us up to a minute."""
     seed: int = Field(0, ge=0)
     """Seed of path, threshold noise and depth noise."""
 
     def __init__(self, **values: Any) -> None:
-        """Check the values; the first that cannot be used raises `ConfigError`."""
+        """Check the values; the first invalid one raises `ConfigError`."""
         try:
             super().__init__(**values)
         except ValidationError as error:
