@@ -166,7 +166,7 @@ def _checked(
             except OSError as error:
                 reason = str(error.strerror or error)
             logger.warning(
-                "%s: no copy of its events in %s (%s); they are checked anew each time",
+                "%s: no copy of its events in %s (%s); they are checked again each time",
                 *(source.path, stored.folder.parent, reason),
             )
             checker = EventChecker(source, size, columns)

@@ -124,7 +124,7 @@ def test_several_event_folders_are_chosen_by_threshold(tmp_path: Path) -> None:
     assert EventReplicaSequence(folder).contrast_threshold == 0.25
 
 
-def test_locally_unsorted_stamps_come_out_sorted_and_complete(tmp_path: Path) -> None:
+def test_locally_unsorted_stamps_are_sorted_and_complete(tmp_path: Path) -> None:
     events = some_events(20000)
     block = np.floor(events[:, 2] * 1000)
     shuffled = events[np.argsort(block + np.random.default_rng(1).random(len(events)) * 0.99)]
@@ -436,7 +436,7 @@ def test_a_description_is_one_short_line_of_text(tmp_path: Path, text: str, show
     assert EventReplicaSequence(folder).description == shown
 
 
-def test_camera_json_may_begin_with_a_mark_and_hold_other_programs_keys(tmp_path: Path) -> None:
+def test_camera_json_may_have_a_byte_order_mark_and_unknown_keys(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "s")
     values = CAMERA | {"k1": 0.0, "distortion": [0, 0], "serial": "x" * 100_000, "nested": {"a": [1]}}
     (folder / "camera.json").write_text("\ufeff" + json.dumps(values), encoding="utf-8")
