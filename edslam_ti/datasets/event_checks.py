@@ -217,8 +217,8 @@ class EventChecker:
         stamps = np.concatenate([self._recent, stamps])
         is_wrong = _is_out_of_order(stamps, np.ones(len(stamps), bool))
         is_wrong &= np.abs(stamps - _running_median(stamps)) > DISORDER
-        # A good stamp next to a gap and a bad stamp may be far from its median. Without the bad stamp it is in
-        # order.
+        # A good stamp next to a gap and a bad stamp may be far from its median. Without the bad stamp it is
+        # in order.
         is_wrong &= _is_out_of_order(stamps, ~is_wrong)
         first = len(self._recent)
         result = np.zeros(len(t), bool)

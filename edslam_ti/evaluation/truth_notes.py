@@ -92,7 +92,7 @@ def _slow(errors: TrajectoryErrors, path: TruePath) -> list[str]:
         return []
     return [
         f"truth comes every {1000 * path.median_step:.3g} ms: half way between, its interpolation is off by "
-        f"about {own:.2g} cm, which is not small beside the ATE of {errors.ate_rmse_cm:.2g} cm"
+        f"about {own:.2g} cm, which is not small compared with the ATE of {errors.ate_rmse_cm:.2g} cm"
     ]
 
 

@@ -11,7 +11,7 @@ from edslam_ti.frame import Frame
 from edslam_ti.mapping.rendering import View
 from edslam_ti.trajectory import Trajectory
 
-Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
+Progress = Callable[[float], bool]  # receives the fraction done, 0 to 1; returns False to stop
 
 
 class Mapper(Protocol):

@@ -123,11 +123,11 @@ def _check_obj_textures(path: Path) -> None:
     for library in libraries:
         file = path.parent / library
         if not file.is_file():
-            raise DataError(f"{path}: its material library '{library}' is missing; put it beside the mesh")
+            raise DataError(f"{path}: its material library '{library}' is missing; put it next to the mesh")
         for texture in _values(file, "map_Kd"):
             name = texture.split()[-1] if texture.startswith("-") else texture
             if not (path.parent / name.replace("\\", "/")).is_file():
-                raise DataError(f"{file}: its texture '{name}' is missing; put it beside the mesh")
+                raise DataError(f"{file}: its texture '{name}' is missing; put it next to the mesh")
 
 
 def _values(path: Path, keyword: str) -> list[str]:

@@ -314,6 +314,6 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "gray_events_data.npy: rows x, y, t (s), polarity -1/+1, sorted by time; a change of\n"
         f"log(grey + {config.log_epsilon:.6g}) by the contrast threshold fires an event, grey in [0, 1].\n"
         "Pixel centres are at integer coordinates.\n"
-        "novel_views/: true views beside the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
+        "novel_views/: true views near the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
         f"Settings:\n{settings}\n"
     )

@@ -58,7 +58,7 @@ class SimulationConfig(Stage):
     depth_gap: tuple[float, float] | None = None
     """Start and length in seconds of an interval whose depth images are lost."""
     compact_events: bool = False
-    """Write events as float32, in half the space; stamps are exact to 0.3 us up to 4 s, 4 us up to a minute."""
+    """Write events as float32, in half the space; stamps are exact to 0.3 us up to 4 s, 4 us up to 1 min."""
     seed: int = Field(0, ge=0)
     """Seed of path, threshold noise and depth noise."""
 
