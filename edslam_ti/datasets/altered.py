@@ -80,7 +80,7 @@ class RepeatedSequence(WrappedSequence):
         super().__init__(sequence)
         self._start = float(truth.timestamps[0])
         self._period = float(truth.timestamps[-1] - truth.timestamps[0])
-        self.description = f"{sequence.description}, {rounds} times on end"
+        self.description = f"{sequence.description}, {rounds} times in a row"
         self._rounds = rounds
         self.depth_timestamps, self._depth = self._repeated(sequence.depth_timestamps)
         self.image_timestamps, self._image = self._repeated(sequence.image_timestamps)

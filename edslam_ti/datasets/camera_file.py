@@ -117,7 +117,7 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in pairs:
         if key in result:
-            raise ValueError(f"the key '{plain(key, 60)}' stands twice")
+            raise ValueError(f"the key '{plain(key, 60)}' occurs twice")
         result[key] = value
     return result
 

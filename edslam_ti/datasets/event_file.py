@@ -143,7 +143,7 @@ def _checked(
     def summarised(num_events: int) -> CopySummary:
         notes = list(source.notes) if isinstance(source, TextRows) else []
         if columns.order != source.columns:
-            notes.append(f"columns look like {' '.join(columns.order)} and are read so")
+            notes.append(f"columns look like {' '.join(columns.order)} and are read in that order")
         notes += _bad_rows_note(checker.bad, checker.num_rows, source.counted)
         dropped = checker.bad.number + (len(source.notes) if isinstance(source, TextRows) else 0)
         if num_events == 0:

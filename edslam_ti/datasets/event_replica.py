@@ -140,7 +140,7 @@ class EventReplicaSequence(EventDepthSequence):
         image_rate = image_rate or calibration.image_rate
         if rate and not image_rate and images and list(images) == list(depth):
             image_rate = rate
-            self.note(f"{image_folder}: numbered as depth is: taken at the same {rate:g} Hz")
+            self.note(f"{image_folder}: numbered like depth: assumed at the same rate, {rate:g} Hz")
         self._image_files, self.image_timestamps = self._with_times(
             image_folder, images, image_rate, "image_rate"
         )

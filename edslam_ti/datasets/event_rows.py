@@ -147,7 +147,7 @@ def _read_layout(path: Path) -> _Layout:
     expected = offset + shape[0] * layout.row_bytes
     if size < expected:
         raise DataError(
-            f"{path}: truncated: the header promises {shape[0]} events ({expected} bytes), the file has "
+            f"{path}: truncated: the header states {shape[0]} events ({expected} bytes), the file has "
             f"{size} bytes, {max(0, size - offset) // layout.row_bytes} events; copy or download it again"
         )
     return layout

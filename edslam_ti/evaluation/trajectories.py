@@ -234,7 +234,7 @@ def _too_few(estimate: Trajectory, truth: Trajectory, num_common: int) -> str:
             ratio = np.ptp(odd) / factor / np.ptp(other)
             meets = odd[0] / factor <= other[-1] and odd[-1] / factor >= other[0]
             if 0.1 < ratio < 30 and (meets or 0.7 < ratio < 1.5):
-                return f"{line} The {name} looks as if in {unit}"
+                return f"{line} The {name} looks as if it were in {unit}"
     if stamps[0] > times[-1] or times[0] > stamps[-1]:
         return f"{line} They begin {abs(stamps[0] - times[0]):.9g} s apart"
     inside = int(((stamps >= times[0]) & (stamps <= times[-1])).sum())

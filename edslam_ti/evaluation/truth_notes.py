@@ -76,8 +76,8 @@ def _few(errors: TrajectoryErrors) -> list[str]:
     if errors.num_poses >= FEW_POSES:
         return []
     return [
-        f"only {errors.num_poses} of {errors.num_estimated} poses are compared with the truth: the errors of "
-        "so few say little"
+        f"only {errors.num_poses} of {errors.num_estimated} poses are compared with the truth: too few "
+        "for reliable errors"
     ]
 
 
@@ -147,7 +147,7 @@ def _shifted(estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, wit
     if abs(shift) < SHORTEST_SHIFT or shifted > CLEARLY_BETTER * as_it_is or as_it_is - shifted < clear:
         return []
     return [
-        f"truth looks {1000 * abs(shift):.0f} ms {'late' if shift > 0 else 'early'}: so shifted, ATE is "
+        f"truth looks {1000 * abs(shift):.0f} ms {'late' if shift > 0 else 'early'}: with this shift ATE is "
         f"{shifted:.2g} instead of {as_it_is:.2g} cm: check the clocks"
     ]
 
@@ -181,7 +181,7 @@ def _orientations(
     so_read = f"ATE {ate_cm(estimated, other):.2g} cm, RPE {cm:.2g} cm, {degrees:.2g} deg"
     if reading.is_inverted:
         start = f"ATE {errors.ate_rmse_cm:.3g} cm, RPE {rpe:.3g} cm, {turn:.2g} deg: poses look inverted"
-    return [f"{start}: the truth's look like {reading.looks}; so read, {so_read}"]
+    return [f"{start}: the truth's look like {reading.looks}; read like that, {so_read}"]
 
 
 def _spread_m(errors: TrajectoryErrors) -> float:

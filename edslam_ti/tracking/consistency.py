@@ -63,8 +63,8 @@ class Consistency:
         if is_contradiction:
             lines.append(
                 f"events and depth contradict each other ({np.sqrt(self.disagreement):.0f} times the "
-                f"expected difference of poses, usual are 3 to 7); check focal length, principal point, "
-                "registration of depth to the event camera, and pixels that fire by themselves"
+                f"expected difference of poses, 3 to 7 is usual); check focal length, principal point, "
+                "registration of depth to the event camera, and noisy pixels"
             )
         return lines
 

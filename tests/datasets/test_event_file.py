@@ -364,7 +364,7 @@ def test_columns_in_another_order_are_detected(tmp_path: Path, order: str) -> No
     rows = some_events()
     events = opened(saved(tmp_path, rows[:, ["xytp".index(name) for name in order]]))
     assert_same(events.between(0, 1), rows)
-    assert events.notes == (f"columns look like {' '.join(order)} and are read so",)
+    assert events.notes == (f"columns look like {' '.join(order)} and are read in that order",)
     rows[:, 2] *= 1e6
     message = rf"columns look like {' '.join(order)}; .* \[:, {order.index('t')}\] by 1e6"
     with pytest.raises(DataError, match=message):
@@ -493,7 +493,7 @@ def test_columns_of_a_text_are_detected(tmp_path: Path, order: str) -> None:
     events = opened(text(tmp_path, columns(order)), is_text=True)
     assert events.between(0, 1).t == pytest.approx(some_events()[:, 2], abs=1e-12)
     assert (events.between(0, 1).x == some_events()[:, 0]).all()
-    assert events.notes == (f"columns look like {' '.join(order)} and are read so",)
+    assert events.notes == (f"columns look like {' '.join(order)} and are read in that order",)
 
 
 @pytest.mark.parametrize(

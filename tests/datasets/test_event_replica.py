@@ -281,7 +281,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "no events": (lambda f: save_events(f, np.empty((0, 4))), r"npy: expected events, got an empty array"),
     "events file of 0 bytes": (_write(EVENTS_FILE, ""), r"npy: the file is empty"),
     "not a npy": (_write(EVENTS_FILE, "hello, not numpy"), r"not readable as a NumPy \.npy file"),
-    "truncated": (_truncate, r"truncated: the header promises 3000 events"),
+    "truncated": (_truncate, r"truncated: the header states 3000 events"),
     "wrong shape": (_events(lambda e: e[:, :3]), r"\(N, 4\) array .* got shape \(3000, 3\)"),
     "x outside": (_set(1700, 0, WIDTH), r"row 1700: expected x in 0 to 31 .* = 32, "),
     "y negative": (_set(1700, 1, -1), r"row 1700: expected x in 0 to 31 and y in 0 to 23"),
@@ -388,7 +388,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "threshold tiny": (_camera(contrast_threshold=1e-300), r"contrast_threshold: .*greater than or equal"),
     "scale huge": (_camera(depth_scale=1e300), r"depth_scale: .*less than or equal to 1000000"),
     "width of 30 digits": (_camera(width=10**30), r"width: .*less than or equal to 32767, got 1000"),
-    "key twice": (_write("camera.json", '{"fx": 30, "fx": 31}'), r"the key 'fx' stands twice"),
+    "key twice": (_write("camera.json", '{"fx": 30, "fx": 31}'), r"the key 'fx' occurs twice"),
     "nested deeply": (
         _write("camera.json", "[" * 100_000),
         r"not readable as JSON: nested",
