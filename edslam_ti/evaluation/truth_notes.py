@@ -181,7 +181,7 @@ def _orientations(
     so_read = f"ATE {ate_cm(estimated, other):.2g} cm, RPE {cm:.2g} cm, {degrees:.2g} deg"
     if reading.is_inverted:
         start = f"ATE {errors.ate_rmse_cm:.3g} cm, RPE {rpe:.3g} cm, {turn:.2g} deg: poses look inverted"
-    return [f"{start}: the truth's look like {reading.looks}; read like that, {so_read}"]
+    return [f"{start}: the truth's look like {reading.looks}; then {so_read}"]
 
 
 def _spread_m(errors: TrajectoryErrors) -> float:

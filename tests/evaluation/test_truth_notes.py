@@ -72,7 +72,7 @@ def test_scale_that_explains_the_error_is_named() -> None:
     [
         (
             lambda T: path_of(rotations=Rotation.from_quat(ROTATIONS.as_quat()[:, [3, 0, 1, 2]])).poses,
-            "orientations look wrong: the truth's look like quaternions wxyz, read as xyzw; read like that, ATE",
+            "orientations look wrong: the truth's look like quaternions wxyz, read as xyzw; then ATE",
         ),
         (np.linalg.inv, "poses look inverted: the truth's look like inverted poses (world-to-camera)"),
         (lambda T: T @ OPENGL, "look like OpenGL's axes"),
