@@ -1,6 +1,6 @@
 """python apps/benchmark.py --suites rasterizer tracking
 
-Time the kernels beside alternatives: `edslam benchmark` from a checkout; --help lists the options.
+Time the kernels against alternatives: `edslam benchmark` from a checkout; --help lists the options.
 """
 
 from edslam_ti.command_line import launch

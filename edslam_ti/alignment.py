@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on SE(3): alignment of images and depth, whatever is aligned to what (Eq. 5)."""
+"""Levenberg-Marquardt on SE(3), for every alignment of images and depth (Eq. 5)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,12 +13,12 @@ from edslam_ti.geometry import inverse, se3_exp
 from edslam_ti.kernels.patch_warp import Alignment, Direction, NormalEquations, ResidualModel
 
 MIN_PIXELS = 200  # fewer residuals than this constrain no pose
-MAX_CONDITION = 1e7  # of the normal equations: beyond, some motion is not observed
-SMALL_GAIN = 1e-4  # relative decrease of the cost: converged
+MAX_CONDITION = 1e7  # condition number of the normal equations beyond which some motion is not observed
+SMALL_GAIN = 1e-4  # converged at this relative decrease of the cost
 
 
 def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualModel:
-    """Return how residuals are weighted, given the standard deviation of those of what is aligned."""
+    """Return how residuals are weighted; `surface_sigma` is the standard deviation of image residuals."""
     return ResidualModel(
         max_depth_difference=config.max_depth_difference,
         surface_sigma=surface_sigma,
@@ -30,7 +30,7 @@ def residual_model(config: TrackingConfig, surface_sigma: float) -> ResidualMode
 
 
 def is_observed(system: NormalEquations) -> bool:
-    """Return whether all six motions show in what is aligned (well-conditioned normal equations)."""
+    """Return whether all six motions are observed (the normal equations are well-conditioned)."""
     if not np.isfinite(system.H).all():
         return False
     eigenvalues = np.linalg.eigvalsh(system.H)
@@ -55,7 +55,7 @@ def linearised(
 
 
 def gauss_newton_step(system: NormalEquations) -> np.ndarray | None:  # [6]
-    """Return the twist that minimises a linearised system; None: it has no single minimum."""
+    """Return the twist that minimises a linearised system; None: it has no unique minimum."""
     try:
         step = -np.linalg.solve(system.H, system.g)
     except np.linalg.LinAlgError:
@@ -71,7 +71,7 @@ def levenberg_marquardt(
 ) -> tuple[np.ndarray, NormalEquations]:
     """Minimise over T <- T exp(xi), given the normal equations at a pose; return pose and system.
 
-    It ends when the cost decreases by less than `small_gain` of itself.
+    Iteration ends when the relative decrease of the cost is below `small_gain`.
     """
     T, damping = T_world_camera, 1e-4
     system = linearise(T)
@@ -97,7 +97,7 @@ def levenberg_marquardt(
 
 
 def _mean_cost(system: NormalEquations) -> float:
-    """Return the cost per visible pixel, with a charge for pixels lost from view."""
+    """Return the cost per usable pixel, with a penalty for pixels lost from view."""
     if system.num_surface == 0:
         return np.inf
     lost = max(system.num_usable - system.num_surface, 0)

@@ -1,8 +1,8 @@
-"""Arguments of a command, read into the fields of a settings model, and the help made of the same fields.
+"""Reads a command's arguments into the fields of a settings model, and makes the help from the same fields.
 
-Every field is an option: `--stage.field VALUE`, `--stage.field=VALUE`, several values for a tuple, and none
-for a switch that is meant to be true. Words are converted here by the field's type; the model itself checks
-ranges, so that a value out of range has one message, whether it came from a file or from an option.
+Every field is an option: `--stage.field VALUE` or `--stage.field=VALUE`. A tuple takes several values; a
+boolean without a value is true. This module converts words by the field's type. The model itself checks
+ranges, so a value out of range gives the same message from a file and from an option.
 """
 
 import difflib
@@ -50,12 +50,12 @@ class Option:
 
     @property
     def shown(self) -> Shown | None:
-        """How the model wants it shown."""
+        """How help shows the option, if the model says so."""
         return next((x for x in self.field.metadata if isinstance(x, Shown)), None)
 
     @property
     def is_positional(self) -> bool:
-        """Whether it is given without a flag."""
+        """Whether the option is given without a flag."""
         return self.shown is not None and self.shown.is_positional
 
     @property
@@ -67,12 +67,12 @@ class Option:
 
     @property
     def label(self) -> str:
-        """What messages call it."""
+        """The option's name in messages."""
         return self.shown.metavar if self.shown is not None and self.is_positional else self.flags[0]
 
     @property
     def metavar(self) -> str:
-        """What help shows for its values."""
+        """The placeholder for the option's values in help."""
         return self.shown.metavar if self.shown is not None else _metavar(self.kind)
 
 
@@ -91,7 +91,7 @@ def options_of(model: type[BaseModel], stages: tuple[str, ...] = ()) -> list[Opt
 def read_options(
     model: type[Options], arguments: Sequence[str] | None, program: str, description: str | None
 ) -> Options:
-    """Return a command's options, read from its arguments (None: the process's own) and checked."""
+    """Read a command's options from its arguments (None: those of the process), and check them."""
     given = read_given(model, arguments, program, description)
     missing = [option for option in options_of(model) if _is_missing(option, given)]
     if missing:
@@ -106,7 +106,7 @@ def read_given(
     description: str | None,
     notes: Notes | None = None,
 ) -> Values:
-    """Return the values that were given, converted to the fields' types but not checked.
+    """Return the given values, converted to the fields' types but not checked.
 
     With -h or --help anywhere, print the help and exit. `notes` adds lines to the help of options.
     """
@@ -143,13 +143,13 @@ def read_given(
 
 
 def nearest_name_hint(name: str, known: Sequence[str]) -> str:
-    """Return `; did you mean 'scene'?` for a name that is close to a known one, else nothing."""
+    """Return `; did you mean 'scene'?` for a name that is close to a known one, else an empty string."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def _describe_unknown(word: str, known: list[str]) -> str:
-    """Say which option was probably meant."""
+    """Return a message that names the option that was probably meant."""
     if not word.startswith("-"):
         return f"unexpected argument '{word}'; options look like --scene office0"
     option = word.split("=")[0].replace("_", "-")
@@ -164,7 +164,7 @@ def _describe_unknown(word: str, known: list[str]) -> str:
 
 
 def _take(kind: Any, words: list[str]) -> list[str]:
-    """Remove the words of one option's value from the front of `words`: up to the next option at most."""
+    """Remove the words of one option's value from the front of `words`, at most up to the next option."""
     most = 1 if words[:1] == ["None"] else _num_words(kind)
     taken: list[str] = []
     while words and not words[0].startswith("--") and (most is None or len(taken) < most):
@@ -225,7 +225,7 @@ def _tuple(items: tuple[Any, ...], words: list[str]) -> tuple[Any, ...]:
 
 
 def _boolean(word: str) -> bool:
-    """Read true and false in any case, as YAML has them."""
+    """Read true or false in upper or lower case, as YAML does."""
     return {"true": True, "false": False}[word.lower()]
 
 

@@ -13,7 +13,7 @@ SHORTEST_FOCAL, LONGEST_FOCAL = (
 )  # longer sides; beyond any fisheye, any telescope
 FARTHEST_CENTRE = 10  # longer sides; cut-outs have their centre outside
 
-NEAREST = 0.05  # metres: what is nearer than this does not count as in view
+NEAREST = 0.05  # metres: points nearer than this do not count as in view
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,9 @@ class Camera:
         points: np.ndarray,  # [..., 3] metres, camera frame
         nearest: float = 1e-6,  # metres
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # [...] each
-        """Return where points are seen, u and v in pixels, and their depths z in metres.
+        """Return the pixels u and v of points, and their depths z in metres.
 
-        Nothing is cut off: pixels may lie outside the image, and points at a depth below `nearest`, also
+        No point is removed: pixels may lie outside the image. Points at a depth below `nearest`, including
         those behind the camera, are divided by `nearest` instead of their depth. Callers select by z.
         """
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
@@ -104,7 +104,7 @@ class Camera:
         depth: np.ndarray,  # [H, W] metres
         mask: np.ndarray | None = None,  # [H, W] bool; None: where there is depth
     ) -> np.ndarray:  # [N, 3] metres, camera frame
-        """Return the points that the pixels of a depth image see, row by row."""
+        """Return the points of a depth image's pixels, row by row."""
         if depth.shape != self.shape:
             raise DataError(f"depth: expected shape {self.shape}, got {depth.shape}")
         v, u = np.nonzero(depth > 0 if mask is None else mask)
@@ -116,5 +116,5 @@ class Camera:
         v: np.ndarray,  # [...] pixels
         depth: np.ndarray,  # [...] metres
     ) -> np.ndarray:  # [..., 3] metres, camera frame
-        """Return the points that are seen at pixels (u, v) at these depths."""
+        """Return the points at pixels (u, v) and these depths."""
         return np.stack([(u - self.cx) / self.fx * depth, (v - self.cy) / self.fy * depth, depth], -1)

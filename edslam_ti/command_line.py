@@ -1,4 +1,4 @@
-"""From the command line to validated settings, and from errors to one line and an exit code.
+"""Turns the command line into validated settings, and errors into one line and an exit code.
 
 Settings come from, each overriding the one before: defaults, configs/<dataset>.yaml, the method's preset,
 --config FILE, flags. Every field of `Config` is a flag, `--stage.field VALUE` for nested ones.
@@ -83,7 +83,7 @@ def _settings_of(resumed: Path, file: Path | None, given: dict[str, Any]) -> Pat
 def with_presets(choices: Choices, configs: Path = CONFIGS) -> Config:
     """Return a run's settings; `configs` is the folder of <dataset>.yaml files.
 
-    Without --dataset the data folder is looked at to find the format, which loads torch.
+    Without --dataset it detects the format from the data folder, which loads torch.
     """
     dataset = choices.config.dataset
     if dataset is None:
@@ -103,7 +103,7 @@ def parse_config(
 
 
 def launch(main: Callable[[], None]) -> None:
-    """Run a command: what a user can mend ends in one line on stderr and an exit code, not in a traceback."""
+    """Run a command; errors that a user can fix print one line on stderr and no traceback."""
     try:
         main()
     except UsageError as error:
@@ -112,7 +112,7 @@ def launch(main: Callable[[], None]) -> None:
         _exit(LOST, str(error))
     except EdSlamError as error:
         _exit(FAILED, str(error))
-    except BrokenPipeError:  # the reader of our output is gone, as in `| head`
+    except BrokenPipeError:  # the reader of the output has ended, as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(FAILED)
     except OSError as error:  # of the system: a full disk, say, which names no file

@@ -1,4 +1,4 @@
-"""Every setting, one validated model per stage: default, unit and source beside each field.
+"""Every setting, one validated model per stage: each field states its default, unit and source.
 
 Files and flags state differences only; a key that is unknown, or a value out of range, is an error
 that names the field. A field that was renamed keeps its old name for files and flags:
@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 
 from edslam_ti.errors import ConfigError, EdSlamError, plain, shown
 
-CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: what a data set needs
+CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: settings for a data set
 
 
 class Stage(BaseModel):
@@ -45,46 +45,46 @@ class ImageTrackingConfig(Stage):
     """Tracking by log-brightness images made of events, the default tracker (beyond the paper)."""
 
     image_width: int = Field(192, ge=16)
-    """Images are halved until they are about this many pixels wide: the noise of events averages out."""
+    """Images are halved until they are about this many pixels wide, which averages out event noise."""
     num_pixels: int = Field(8100, ge=100)
-    """Pixels of a keyframe's image that are aligned; half as many at half the size."""
+    """Number of a keyframe's pixels that are aligned; half as many at half the size."""
     strong_gradient: float = Field(0.02, ge=0)
-    """Pixels with a larger gradient are aligned first, log brightness per pixel."""
+    """Gradient in log brightness per pixel; pixels with a larger one are chosen first."""
     steps: int = Field(6, ge=1)
-    """At most this many Levenberg-Marquardt steps a level; twice as many without depth."""
+    """At most this many Levenberg-Marquardt steps per level; twice as many without depth."""
     max_misfit: float = Field(0.25, gt=0)
     """Median absolute difference of log brightness beyond which tracking has failed."""
     doubtful: float = Field(1.25, ge=1)
-    """A frame that fits this many times worse than usual is aligned from the last pose, too."""
+    """A frame that fits this many times worse than usual is aligned a second time, from the last pose."""
     max_misfits: int = Field(4, ge=0)
-    """After more failed frames in a row than this, the keyframe's image is given up."""
+    """After more than this many failed frames in a row, the keyframe's image is discarded."""
     window: int = Field(12, ge=5)
     """Frames that a keyframe's image can be solved from."""
     observations: int = Field(5, ge=2)
-    """Of them, the frames that it is solved from, spread evenly."""
+    """Of these, the number of evenly spaced frames that it is solved from."""
     min_frames: int = Field(5, ge=3)
     """Frames with events before the first image is solved."""
     min_flow: float = Field(1.5, gt=0)
-    """Pixels of brightness images that the scene must have moved before the first image is solved."""
+    """Optical flow in pixels of brightness images that is needed before the first image is solved."""
     solve_interval: int = Field(3, ge=1)
-    """At least this many frames lie between two solutions of one keyframe's image."""
+    """At least this many frames between two solves of one keyframe's image."""
     silent_share: float = Field(0.02, ge=0, lt=1)
-    """Fewer events than this share of the usual number: the camera or the event stream has stopped."""
+    """With fewer events than this share of the usual number, the camera or the event stream has stopped."""
     slowing_share: float = Field(0.2, ge=0, lt=1)
-    """Fewer events than this share in the frame before: the camera was coming to rest."""
+    """With fewer events than this share in the frame before, the camera was coming to rest."""
     silent_flow: float = Field(0.3, ge=0)
-    """Pixels of motion a frame from which a camera does not stop within one frame: events are missing."""
+    """Optical flow in pixels per frame; a faster camera cannot stop within one frame: events are missing."""
     revisit_overlap: float = Field(0.6, gt=0, lt=1)
     """Share of an old keyframe's pixels that must be in view again to close a loop."""
     revisit_misfit: float = Field(0.12, gt=0)
-    """Median absolute difference of log brightness up to which two keyframes show the same place."""
+    """Two keyframes show the same place up to this median absolute difference of log brightness."""
 
 
 class TrackingConfig(Stage):
-    """Trackers of Sec. III-B: time surfaces (Eq. 5), images made of events, or both in turn."""
+    """Trackers of Sec. III-B: time surfaces (Eq. 5), images made of events, or one after the other."""
 
     brightness: bool = True
-    """Align to log-brightness images made of events once there are some; False: time surfaces only."""
+    """Align to log-brightness images made of events once the first exists; False: time surfaces only."""
     images: ImageTrackingConfig = ImageTrackingConfig()
     brightness_sigma: float = Field(0.15, gt=0)
     """Images: standard deviation of a log-brightness residual."""
@@ -98,21 +98,21 @@ class TrackingConfig(Stage):
     references: Literal["previous", "keyframe", "both"] = "keyframe"
     """Time surfaces: frames to align to: the last one (paper), the keyframe (less drift), or both."""
     directions: Literal["both", "forward"] = "both"
-    """Time surfaces: patches of the reference seen in the new frame (forward), and also the other way round
-    (Eq. 5)."""
+    """Time surfaces: warp patches of the reference into the new frame (forward), or also patches of the new
+    frame into the reference (both, Eq. 5)."""
     form: Literal["additive", "compositional"] = "additive"
-    """Time surfaces: Jacobians of the view that patches are warped to, anew at each step (additive), or of
+    """Time surfaces: compute Jacobians in the view that patches are warped to, at each step (additive), or in
     the patches, once (inverse compositional, Baker and Matthews 2004)."""
     surface_sigma: float = Field(0.15, gt=0)
     """Time surfaces: standard deviation of a residual."""
     levels: int = Field(3, ge=1, le=6)
     """Time surfaces: pyramid levels, coarse to fine."""
     iterations: int = Field(20, ge=1)
-    """Time surfaces: at most this many Levenberg-Marquardt steps a level."""
+    """Time surfaces: at most this many Levenberg-Marquardt steps per level."""
     max_depth_difference: float = Field(0.1, gt=0)
     """tau_d in metres: a warped pixel whose depth disagrees by more is discarded (Sec. IV-A)."""
     depth_weight: float = Field(3.0, ge=0)
-    """Weight of depth residuals beside those of time surfaces or images; 0: Eq. 5 alone."""
+    """Weight of depth residuals relative to those of time surfaces or images; 0: Eq. 5 alone."""
     depth_sigma: float = Field(0.003, gt=0)
     """Standard deviation of depth at short range, metres."""
     depth_sigma_2: float = Field(0.0019, ge=0)
@@ -120,20 +120,20 @@ class TrackingConfig(Stage):
     huber_threshold: float = Field(1.345, gt=0)
     """Residuals beyond this many standard deviations count linearly (Eq. 5 sums unsquared norms)."""
     min_overlap: float = Field(0.8, gt=0, lt=1)
-    """Below this fraction of its pixels in view, a keyframe is replaced by the new frame."""
+    """With less than this fraction of its pixels in view, a keyframe is replaced by the new frame."""
     min_inliers: float = Field(0.3, gt=0, lt=1)
-    """Below this fraction of pixels in agreement, tracking has failed."""
+    """With less than this fraction of pixels in agreement, tracking has failed."""
 
 
 class KeyframeConfig(Stage):
-    """When a frame becomes a keyframe, and how many frames are the newest (Sec. III-E)."""
+    """When a frame becomes a keyframe, and how many frames count as newest (Sec. III-E)."""
 
     min_covisibility: float = Field(0.85, gt=0, lt=1)
-    """A frame sharing a smaller fraction of visible Gaussians with the last keyframe becomes one."""
+    """A frame that shares a smaller fraction of visible Gaussians with the last keyframe becomes one."""
     max_translation: float = Field(0.05, gt=0)
-    """Also beyond this translation relative to the median depth (MonoGS: 0.02 to 0.04)."""
+    """So does a frame beyond this translation relative to the median depth (MonoGS: 0.02 to 0.04)."""
     num_chunks: int = Field(5, ge=1)
-    """N: so many newest frames (event chunks) get half of the optimisation steps after each frame; all kept
+    """N: the newest N frames (event chunks) get half of the optimisation steps after each frame; all kept
     frames share the other half."""
 
 
@@ -147,31 +147,33 @@ class MappingConfig(Stage):
     final_iterations: int = Field(400, ge=0)
     """Steps over all kept frames after the last frame."""
     budget: float | None = Field(None, gt=0)
-    """Seconds of mapping per second of data, steps left out to keep to it (results then depend on the
-    machine's speed); taking in depth and solving brightness are never left out. Omitted: no limit."""
+    """Seconds of mapping per second of data. Beyond it, steps are skipped, so results depend on the machine's
+    speed; inserting Gaussians and solving brightness are never skipped. Omitted: no limit."""
     pixel_stride: int = Field(2, ge=1)
     """One new Gaussian for every stride x stride pixels that need one."""
     min_visibility: float = Field(0.8, gt=0, lt=1)
     """lambda_V of Eq. 13: pixels with less alpha get new Gaussians (Sec. IV-A)."""
     depth_error_factor: float = Field(50.0, gt=0)
-    """lambda_MDE of Eq. 13: so many median depth errors also ask for new Gaussians (Sec. IV-A)."""
+    """lambda_MDE of Eq. 13: pixels whose depth error exceeds this multiple of the median get new Gaussians
+    (Sec. IV-A)."""
     max_gaussians: int = Field(300_000, ge=1)
-    """No Gaussians are added beyond this; beyond half of it, the fuller the map, the coarser the new ones."""
+    """Largest number of Gaussians; beyond half of it, the fuller the map, the coarser the new ones."""
     initial_size: float = Field(0.25, gt=0)
     """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
     initial_opacity: float = Field(0.95, gt=0, lt=1)
     """Opacity of a new Gaussian."""
     min_opacity: float = Field(0.05, ge=0, lt=1)
-    """Gaussians that have become fainter are pruned."""
+    """Gaussians with a lower opacity are pruned."""
     stretch: float = Field(3.0, gt=0)
-    """Seconds of events that count from one start image; then a new one, lest errors pile up."""
+    """Seconds of events measured from one start image; each such window has its own, so that errors do not
+    accumulate."""
     solved_views: int = Field(24, ge=3)
-    """At most so many frames of a stretch are compared when its start image is solved."""
+    """At most this many frames of a window are compared when its start image is solved."""
     max_views: int = Field(150, ge=10)
-    """At most so many frames are kept to optimise the map for; older ones are thinned out."""
+    """At most this many frames are kept to optimise the map for; older ones are thinned out."""
     frames: bool = False
-    """Use the sequence's grey images, too, freed of motion blur by the events of their exposure; they also
-    tell the level of brightness. Held-out frames' images stay unused."""
+    """Also use the sequence's grey images, after removing motion blur with the events of their exposure; they
+    determine the level of brightness. Images of held-out frames are not used."""
     exposure: float | None = Field(None, ge=0, lt=1)
     """Seconds over which such an image integrates, centred on its time; omitted: the data set's own
     (camera.json), else 0: images are sharp."""
@@ -187,9 +189,9 @@ class MappingConfig(Stage):
     densify: bool = False
     """Clone, split and prune Gaussians by their gradients during the final steps (as gsplat does)."""
     densify_every: int = Field(100, ge=1)
-    """Steps between two of these (gsplat: 100), in the first half of the final steps."""
+    """With densify: every this many steps (gsplat: 100), in the first half of the final steps."""
     densify_gradient: float = Field(2e-4, gt=0)
-    """Mean gradient in the image, in half image widths, from which on one Gaussian becomes two (gsplat)."""
+    """A Gaussian with a larger mean gradient in the image, in half image widths, becomes two (gsplat)."""
     opacity_reset_every: int = Field(3000, ge=1)
     """With densify: final steps between two resets of all opacities to 0.01 (gsplat: 3000)."""
     log_epsilon: float = Field(0.004, gt=0)
@@ -207,8 +209,8 @@ class MappingConfig(Stage):
     colors_rate: float = Field(6e-2, gt=0)
     """Adam's learning rate of the brightness logits."""
     brightness_cells: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.8)
-    """Edge lengths in metres of cells whose Gaussians share a brightness offset. Events tie brightness
-    only across edges, so that large surfaces converge slowly one Gaussian at a time."""
+    """Edge lengths in metres of cells whose Gaussians share a brightness offset. Events constrain brightness
+    only across edges, so without cells large surfaces converge slowly."""
     cells_rate: float = Field(2e-2, gt=0)
     """Adam's learning rate of the cells' brightness offsets."""
     bundle_adjustment: bool = True
@@ -223,9 +225,9 @@ class EvaluationConfig(Stage):
     hold_out_every: int = Field(5, ge=2)
     """Every n-th frame is held out: its depth and its exact time stamp are never used for mapping."""
     max_images: int = Field(20, ge=1)
-    """At most this many views of each kind (held out, mapped, beside the path) are rendered and compared."""
+    """At most this many views of each kind (held out, mapped, novel) are rendered and compared."""
     flythrough_frames: int = Field(100, ge=1)
-    """At most this many frames of `flythrough.mp4`, 15 a second."""
+    """At most this many frames in `flythrough.mp4`, 15 per second."""
     lpips_weights: Path | None = None
     """LPIPS weights (AlexNet backbone and linear heads in one torch state dict)."""
 
@@ -236,12 +238,12 @@ class Config(Stage):
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
     dataset: str | None = None
-    """Input format: event_replica, rpg, rgbd, builtin; omitted: found by the files under the data
+    """Input format: event_replica, rpg, rgbd, builtin; omitted: detected from the files in the data
     folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
     method: str = "ed_slam"
-    """What runs: a pair of a tracker and a mapper."""
+    """Method to run: a tracker and a mapper."""
     start: float = Field(0.0, ge=0)
     """Seconds of the sequence to skip."""
     duration: float | None = Field(None, gt=0)
@@ -249,21 +251,21 @@ class Config(Stage):
     poses: Literal["tracked", "truth"] = "tracked"
     """truth: skip tracking and map with the true poses."""
     contrast_threshold: float | None = Field(None, ge=1e-3, le=10)
-    """C in Eq. 11; omitted: the data set's own (camera.json), else estimated from its images, else 0.1,
-    for events alone do not fix it (log brightness is then known up to a factor). Given: the mean of C+
+    """C in Eq. 11. Omitted: the data set's own (camera.json), else estimated from its images, else 0.1;
+    events alone do not determine it, so log brightness is then known up to a factor. Given: the mean of C+
     and C-, whose ratio is estimated from the images, if there are any."""
     max_interval: float = Field(0.05, ge=1e-3)
-    """Longest time between tracked frames in seconds; sparser depth is bridged by event-only frames."""
+    """Longest time between tracked frames in seconds; frames without depth fill longer intervals."""
     out: Path = Path("results")
     """Folder that receives the results."""
     checkpoint: float = Field(60.0, ge=0)
     """Seconds between checkpoints, from which `--resume RUN` goes on with a run that was cut off; 0: none.
     Less often where they would take more than 2 % of the time."""
     visualize: bool = False
-    """Follow the run in an Open3D window."""
+    """Show the run in an Open3D window."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the kernels run. A run refuses cuda: rendering and tracking are not right there yet; the kernels
-    alone and the benchmark can use it."""
+    """Device of the kernels. A run refuses cuda, because rendering and tracking are not right there yet; the
+    kernels alone and the benchmark can use it."""
     threads: int = Field(2, ge=1, le=256)
     """CPU threads of the kernels; results are identical for the same number."""
     seed: int = Field(0, ge=0)
@@ -312,19 +314,19 @@ def read_differences(path: Path) -> dict[str, Any]:
 
 
 def dataset_differences(dataset: str, folder: Path = CONFIGS) -> dict[str, Any]:
-    """Return what a data set's own file changes; most need none."""
+    """Return the settings in a data set's own file; most need none."""
     path = folder / f"{dataset}.yaml"
     return read_differences(path) if path.is_file() else {}
 
 
 def former_names(field: FieldInfo) -> list[str]:
-    """Return the names that a field had before."""
+    """Return a field's former names."""
     alias = field.validation_alias
     return [str(name) for name in alias.choices[1:]] if isinstance(alias, AliasChoices) else []
 
 
 def with_present_names(model: type[BaseModel], values: dict[str, Any]) -> dict[str, Any]:
-    """Return (nested) values with the present names of fields that are given by former ones."""
+    """Return (nested) values with former names of fields replaced by present ones."""
     present = {old: name for name, field in model.model_fields.items() for old in former_names(field)}
     result = {}
     for key, value in values.items():

@@ -1,7 +1,7 @@
-"""Depth images: reduced, with holes filled, and where one surface ends and another begins.
+"""Depth images: reduction, filling of holes, and detection of edges between surfaces.
 
-Depth is in metres, 0 = missing. Whether pixels belong to the same surface is asked for five purposes. They
-differ in what is compared and in which mistake costs more, hence in their limits, all shares of the depth:
+Depth is in metres, 0 = missing. Five functions test whether pixels belong to the same surface. They compare
+different quantities and fear different mistakes, so their limits differ. All are shares of the depth:
 
     halving for the tracker       range of 2 x 2 depths          HALVED_RANGE
     reducing for brightness       range of a block's depths      REDUCED_RANGE
@@ -9,10 +9,10 @@ differ in what is compared and in which mistake costs more, hence in their limit
     normals of new Gaussians      second difference              SMOOTH_STEP
     fusing rendered depth         difference of two neighbours   FUSED_STEP
 
-Kernels ask the same of warped points, with constants of their own (`SAME_SURFACE` and `OCCLUSION` in
+Kernels test the same of warped points, with constants of their own (`SAME_SURFACE` and `OCCLUDED` in
 `kernels/brightness_image.py`, `MAX_SLOPE` in `kernels/patch_warp.py`, `DepthAgreement` in
-`kernels/depth_average.py`, the setting `max_depth_difference` in metres): there noise and errors of the
-pose come in, too.
+`kernels/depth_average.py`, the setting `max_depth_difference` in metres), because noise and errors of the
+pose matter there, too.
 """
 
 import cv2
@@ -20,22 +20,23 @@ import numpy as np
 
 from edslam_ti.kernels.brightness_image import SAME_SURFACE
 
-# Of 2 x 2 pixels: steeper slopes have no use in tracking, and a mean over an edge is a surface nowhere.
+# Largest range in 2 x 2 pixels: tracking has no use for steeper slopes, and a mean across an edge lies on no
+# surface.
 HALVED_RANGE = 0.05
-# Of a block: the solver accepts SAME_SURFACE to either side of its mean.
+# Largest range in a block: the solver accepts SAME_SURFACE to either side of its mean.
 REDUCED_RANGE = 2 * SAME_SURFACE
-# From there on neighbours are two surfaces. No slant reaches it, since a plane has hardly any second
-# difference. A false alarm costs a few Gaussians, a miss a ragged outline.
+# Beyond this neighbours are two surfaces. Slanted surfaces stay below, since a plane has hardly any second
+# difference. A false alarm costs a few Gaussians, a miss gives a ragged outline.
 OUTLINE_STEP = 0.03
-# Up to there the neighbours on both sides give a normal. Stricter: a wrong normal tilts a disc out of the
-# surface, whereas none leaves it facing the camera.
+# Below this the neighbours on both sides give a normal. This limit is stricter, because a wrong normal tilts
+# a disc out of the surface; a missing normal only leaves it facing the camera.
 SMOOTH_STEP = 0.02
-# From there on a pixel of a rendered view may lie between two surfaces. Slants of up to 5 % a pixel stay.
+# Beyond this a pixel of a rendered view may lie between two surfaces. Slopes of up to 5 % a pixel are kept.
 FUSED_STEP = 0.05
 
 HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
 FAR_SIDE = 90  # percentile of the depth around a hole
-BEHIND = 1.25  # times that is assumed in it: what is too near would hide surfaces measured later
+BEHIND = 1.25  # times that depth is assumed in the hole: if too near, it would hide surfaces measured later
 
 
 def downscaled(image: np.ndarray) -> np.ndarray:  # [H, W] -> [H / 2, W / 2]
@@ -73,8 +74,8 @@ def block_depth(depth: np.ndarray, reduction: int) -> np.ndarray:  # [H, W] -> [
 def beside_steps(
     depth: np.ndarray,  # [H, W] metres, 0 = missing
 ) -> np.ndarray:  # [H, W] bool
-    """Return the pixels beside which depth jumps or ends: outlines, but no slanted surface."""
-    padded = np.pad(depth, 1, mode="reflect", reflect_type="odd")  # goes on as it does
+    """Return the pixels next to which depth jumps or ends; slanted surfaces are not marked."""
+    padded = np.pad(depth, 1, mode="reflect", reflect_type="odd")  # continue the slope
     across = padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * depth
     down = padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * depth
     return np.maximum(np.abs(across), np.abs(down)) > OUTLINE_STEP * depth
@@ -85,7 +86,7 @@ def is_smooth(
     depth: np.ndarray,  # of the pixels
     after: np.ndarray,  # of the neighbours on the other side
 ) -> np.ndarray:  # bool
-    """Return where all three depths exist and the surface goes on through the middle one."""
+    """Return where all three depths exist and lie on one smooth surface."""
     exist = (before > 0) & (depth > 0) & (after > 0)
     return exist & (np.abs(before + after - 2 * depth) < SMOOTH_STEP * depth)
 
@@ -94,7 +95,7 @@ def beside_edges(
     depth: np.ndarray,  # [H, W] metres, 0 = missing
     relative_step: float,  # of neighbouring depths, as a share of the nearer one
 ) -> np.ndarray:  # [H, W] bool
-    """Return the pixels on both sides of a step of depth to a neighbour, or of the end of depth."""
+    """Return the pixels on both sides of a depth step between neighbours, or of the end of depth."""
     edge = np.zeros(depth.shape, bool)
     for a, b, at_a, at_b in (
         (depth[:-1], depth[1:], edge[:-1], edge[1:]),
@@ -110,10 +111,10 @@ def without_depth_edges(
     depth: np.ndarray,  # [H, W] metres, 0 = missing
     relative_step: float = FUSED_STEP,
 ) -> np.ndarray:  # [H, W] metres
-    """Return depth without the pixels on both sides of a step to a neighbour.
+    """Return depth without the pixels on both sides of a step between neighbours.
 
-    Rendered depth is a mean over what a pixel covers: at an outline it lies between two surfaces, where
-    fusion would leave a skirt.
+    Rendered depth is a mean over a pixel's area. At a depth edge it lies between two surfaces, and fusing it
+    would connect them.
     """
     return np.where(beside_edges(depth, relative_step), 0, depth)
 
@@ -121,16 +122,16 @@ def without_depth_edges(
 def with_holes_filled(
     depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
 ) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
-    """Return depth with large holes put behind the far side of what surrounds them.
+    """Return depth with large holes filled slightly behind the far side of their surroundings.
 
-    A sensor sees nothing in windows and beyond its range; something is there all the same, and it is not in
-    front. Narrow holes (shadows of the sensor's projector, noise at edges) stay: another view sees them.
+    A sensor measures nothing in windows and beyond its range, but a surface exists there, and it is not in
+    front. Narrow holes (shadows of the sensor's projector, noise at edges) stay: other views measure them.
     """
     missing = (depth <= 0).astype(np.uint8)
     holes = cv2.morphologyEx(missing, cv2.MORPH_OPEN, np.ones((HOLE_WIDTH, HOLE_WIDTH), np.uint8))
     filled = depth.copy()
     number, labels, boxes, _ = cv2.connectedComponentsWithStats(holes)
-    reach = 2 * (HOLE_WIDTH // 2) + 1  # beyond what opening has removed of the rim
+    reach = 2 * (HOLE_WIDTH // 2) + 1  # more than the opening removes at the rim
     for label in range(1, number):
         left, top, width, height, _ = boxes[label]
         box = np.s_[max(top - reach, 0) : top + height + reach, max(left - reach, 0) : left + width + reach]
@@ -144,7 +145,7 @@ def with_holes_filled(
 
 
 def _corners(image: np.ndarray) -> list[np.ndarray]:  # four [H / 2, W / 2]
-    """Return the four pixels under every pixel of the image at half size."""
+    """Return the four pixels that form each pixel of the image at half size."""
     h, w = (n // 2 for n in image.shape)
     return [image[y : 2 * h : 2, x : 2 * w : 2] for y in (0, 1) for x in (0, 1)]
 

@@ -1,4 +1,4 @@
-"""Errors a user can mend. Each message says what was expected, what came, and what to do: one short line."""
+"""Errors that a user can fix. Each message is one short line: what was expected, what came, what to do."""
 
 import reprlib
 
@@ -9,7 +9,7 @@ LONGEST_VALUE = 200  # characters of one value from a file
 def plain(value: object, limit: int = LONGEST_VALUE) -> str:
     """Return a text that is safe to print: one line of at most `limit` characters, nothing invisible.
 
-    Control characters and halves of surrogate pairs become escapes; what is too long is cut.
+    Control characters and halves of surrogate pairs become escapes; longer texts are cut.
     """
     text = str(value)
     if len(text) > limit:
@@ -23,7 +23,7 @@ def shown(value: object) -> str:
 
 
 class EdSlamError(ValueError):
-    """Root of every error caused by input, not by a defect; apps print it as one line, exit code 1."""
+    """Base of every error caused by input, not by a defect; commands print it as one line, exit code 1."""
 
     def __init__(self, message: str = "") -> None:
         super().__init__(plain(message, LONGEST_MESSAGE))

@@ -30,7 +30,7 @@ class Events:
         return Events(self.x[kept], self.y[kept], self.t[kept], self.polarity[kept])
 
     def pieces(self, length: int) -> Iterator["Events"]:
-        """Yield the events in pieces of at most `length`, so that what is made of them is small."""
+        """Yield the events in pieces of at most `length`, so that results per piece need little memory."""
         return (self[start : start + length] for start in range(0, len(self), length))
 
     @staticmethod

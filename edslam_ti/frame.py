@@ -1,4 +1,4 @@
-"""A sample as tracking and mapping see it, its events counted once for both."""
+"""The frame that tracking and mapping work on; its events are counted once for both."""
 
 import functools
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from edslam_ti.datasets.base import Sample
 from edslam_ti.events import Events
 from edslam_ti.kernels.time_surface import count_events
 
-EVENTS_AT_ONCE = 1_000_000  # whose pixels are held in memory
+EVENTS_AT_ONCE = 1_000_000  # events whose pixel indices are held in memory at once
 
 
 class EventCounts:
-    """Events pixel by pixel; arrays are shared, do not change them."""
+    """Event counts per pixel; the arrays are shared, do not change them."""
 
     def __init__(self, events: Events, shape: tuple[int, int]) -> None:  # (H, W)
         self.numbers = np.zeros((*shape, 2), np.int32)  # [H, W, 2] of negative and positive events
@@ -28,25 +28,25 @@ class EventCounts:
         first = np.zeros_like(self.last)
         for events in reversed(list(self._events.pieces(EVENTS_AT_ONCE))):
             pixel = events.y.astype(np.int64) * first.shape[1] + events.x
-            first.ravel()[pixel[::-1]] = events.polarity[::-1]  # of repeated pixels the last one stays
+            first.ravel()[pixel[::-1]] = events.polarity[::-1]  # repeated pixels keep the value assigned last
         return first
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The end of an event chunk: everything tracking and mapping see of it."""
+    """An event chunk and the depth and image at its end: all data that tracking and mapping get."""
 
     timestamp: float  # seconds
     previous_timestamp: float  # seconds, start of its event chunk
     events: Events  # of its chunk
     camera: Camera
     depth: np.ndarray | None  # [H, W] float32 metres, 0 = missing
-    image: np.ndarray | None  # [H, W] float32 in [0, 1]; only RGB-D baselines look at it
-    is_held_out: bool = False  # kept from mapping, for evaluation
+    image: np.ndarray | None  # [H, W] float32 in [0, 1]; only RGB-D baselines use it
+    is_held_out: bool = False  # reserved for evaluation, not used for mapping
 
     @functools.cached_property
     def event_counts(self) -> EventCounts:
-        """The events of its chunk by pixel (Eq. 11), counted when first asked for."""
+        """The chunk's events per pixel (Eq. 11), counted on first access."""
         return EventCounts(self.events, self.camera.shape)
 
 

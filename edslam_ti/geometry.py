@@ -1,4 +1,4 @@
-"""SE(3): one name for each operation, on numpy arrays or torch tensors; what comes out is of the same kind.
+"""SE(3): one name for each operation, on numpy arrays or torch tensors; the result has the input's type.
 
 Poses are 4x4 matrices `T_a_b` that map points of frame b into frame a. Twists are 6-vectors in the
 order (translation, rotation). Formulas: Barfoot, State Estimation for Robotics, ch. 7; the small-angle
@@ -96,7 +96,7 @@ def _log_of_pose(T: np.ndarray) -> np.ndarray:  # [4, 4] -> [6]
     sine = math.sqrt(float(axis @ axis))
     angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1))
     if angle > 3:
-        return _log_of_tensors(torch.from_numpy(T)).numpy()  # near 180 degrees the sine says little
+        return _log_of_tensors(torch.from_numpy(T)).numpy()  # near 180 degrees the sine is inaccurate
     w = axis * (angle / sine if sine > SMALL_ANGLE_SQUARED else 1.0)
     return np.concatenate([np.linalg.solve(_rotation_and_jacobian(w)[1], T[:3, 3]), w])
 
@@ -171,7 +171,7 @@ def transformed(T: np.ndarray, points: np.ndarray) -> np.ndarray:  # [4, 4], [..
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:  # [..., 4] wxyz each
-    """Return the quaternion of turning by b, and then by a."""
+    """Return the quaternion of the rotation by b followed by the rotation by a."""
     (w, x, y, z), (p, q, r, s) = a.unbind(-1), b.unbind(-1)
     product = (
         *(w * p - x * q - y * r - z * s, w * q + x * p + y * s - z * r),
@@ -195,5 +195,5 @@ def rotation_angle_deg(T: np.ndarray) -> float:  # [4, 4] -> degrees
 
 
 def is_near(T: np.ndarray, distance: float, angle: float) -> bool:  # [4, 4], metres, degrees
-    """Return whether a motion is shorter and turns less than that."""
+    """Return whether a motion has a translation below `distance` and a rotation below `angle`."""
     return float(np.linalg.norm(T[:3, 3])) < distance and rotation_angle_deg(T) < angle

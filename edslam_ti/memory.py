@@ -1,11 +1,11 @@
-"""Memory that is free, given back to the system."""
+"""Returns free memory to the operating system."""
 
 import ctypes
 from collections.abc import Callable
 
 
 def _found_trim() -> Callable[[int], int] | None:
-    """Return glibc's malloc_trim, None where there is another C library."""
+    """Return glibc's malloc_trim; None with another C library."""
     try:
         return ctypes.CDLL("libc.so.6").malloc_trim
     except (OSError, AttributeError):
@@ -16,10 +16,10 @@ _trim = _found_trim()
 
 
 def release_free_memory() -> None:
-    """Give back to the system what the allocator keeps between what is in use; with glibc, else nothing.
+    """Return free memory from glibc's allocator to the system; does nothing with another C library.
 
-    Arrays of always other sizes leave gaps that none of the next fits into, so that a process grows though
-    what it keeps does not. Takes milliseconds.
+    Allocations of varying size fragment the heap, so the process grows although live memory does not. Takes
+    milliseconds.
     """
     if _trim is not None:
         _trim(0)

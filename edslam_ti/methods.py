@@ -1,4 +1,4 @@
-"""Methods by name. A method is a pair of a Tracker and a Mapper put into the same `Slam`."""
+"""Methods by name. A method is a Tracker and a Mapper; all methods share one loop (`Slam`)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from edslam_ti.errors import DataError
 
-if TYPE_CHECKING:  # a method's parts load Taichi or Open3D, which `--help` need not wait for
+if TYPE_CHECKING:  # `--help` must not load Taichi or Open3D
     from edslam_ti.config import Config
     from edslam_ti.datasets import EventDepthSequence
     from edslam_ti.event_images.contrast import ContrastThreshold
@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # a method's parts load Taichi or Open3D, which `--help` need
 
 @dataclass(frozen=True)
 class Method:
-    """How to make a method's two parts, and how its settings differ from the defaults."""
+    """Builds a method's tracker and mapper; names the settings that differ from the defaults."""
 
     description: str
     build: "Build"  # (sequence, contrast threshold, settings) -> tracker and mapper

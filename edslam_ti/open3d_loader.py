@@ -1,4 +1,4 @@
-"""The one place that imports Open3D: lazily, and with libusb-1.0 supplied where the system lacks it."""
+"""The only file that imports Open3D; it does so lazily, and supplies libusb-1.0 if the system lacks it."""
 
 import ctypes
 from functools import cache

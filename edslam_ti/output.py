@@ -1,6 +1,6 @@
-"""Outputs that appear whole or not at all: written under a temporary name, then renamed.
+"""Atomic outputs: files and folders are written under a temporary name, then renamed.
 
-And the header of a .npy file whose number of rows is known only after the last one.
+Also the header of a .npy file whose number of rows is known only at the end.
 """
 
 import ctypes
@@ -131,8 +131,8 @@ def _replace_in_two_steps(new: Path, path: Path, why_keep: WhyKeep | None) -> No
 def write_npy_header(file: BinaryIO, dtype: np.dtype, num_rows: int, num_columns: int) -> None:
     """Write the header of an array [num_rows, num_columns] at the start of a .npy file.
 
-    Rows are appended behind it. NumPy pads the header so that a later call with their true number takes
-    the same space.
+    Append rows after it. NumPy pads the header, so a later call with the true number of rows takes the same
+    space.
     """
     file.seek(0)
     header = {"descr": dtype.str, "fortran_order": False, "shape": (num_rows, num_columns)}

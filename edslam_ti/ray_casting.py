@@ -1,4 +1,4 @@
-"""Rays cast at triangles: the one place that makes an Open3D scene for them (CPU, no display needed)."""
+"""Casts rays at triangles with Open3D (CPU, no display needed); no other file makes an Open3D scene."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from edslam_ti.open3d_loader import load_open3d
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays hit first; arrays have the shape of the rays without their last axis."""
+    """First hits of rays; arrays have the shape of the rays without their last axis."""
 
     distance: np.ndarray  # [...] float32, in lengths of the ray's direction; infinite: nothing hit
     triangle: np.ndarray  # [...] uint32 index of the triangle, undefined where nothing is hit
@@ -25,7 +25,7 @@ class Hits:
 
 
 class RayCaster:
-    """Triangles that rays are cast at and distances are measured to."""
+    """Casts rays at triangles, and measures distances to them."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class RayCaster:
         self,
         rays: np.ndarray,  # [..., 6] float32: origin, direction of any length
     ) -> Hits:
-        """Return what every ray hits first."""
+        """Return the first hit of every ray."""
         hits = self._scene.cast_rays(self._tensor(rays))
         return Hits(
             distance=hits["t_hit"].numpy(),
@@ -72,7 +72,7 @@ class RayCaster:
         self,
         points: np.ndarray,  # [N, 3] float32 metres
     ) -> np.ndarray:  # [N] float32 metres
-        """Return how far points are from the nearest triangle."""
+        """Return the distance of points from the nearest triangle."""
         return np.asarray(self._scene.compute_distance(self._tensor(points)).numpy())
 
 
@@ -80,7 +80,7 @@ def rays_from(
     T_world_camera: np.ndarray,  # [4, 4]
     directions: np.ndarray,  # [..., 3] camera frame
 ) -> np.ndarray:  # [..., 6] float32, world
-    """Return rays that leave a camera's centre."""
+    """Return rays from a camera's centre."""
     turned = directions @ T_world_camera[:3, :3].T
     origins = np.broadcast_to(T_world_camera[:3, 3], turned.shape)
     return np.concatenate([origins, turned], -1).astype(np.float32)

@@ -14,7 +14,7 @@ from edslam_ti.trajectory import Trajectory
 
 @dataclass
 class Slam:
-    """A tracker and a mapper over one trajectory; any pair of them is a method."""
+    """The loop of all methods: a tracker and a mapper that share one trajectory."""
 
     frame_builder: FrameBuilder
     tracker: Tracker
@@ -33,15 +33,15 @@ class Slam:
         return Trajectory(self.trajectory.timestamps, np.array([r.T_world_camera for r in self.results]))
 
     def process(self, sample: Sample, is_held_out: bool = False) -> TrackingResult:
-        """Track one sample and map it; a held-out one is tracked, but its depth is not mapped."""
+        """Track one sample and map it; the depth of a held-out sample is not mapped."""
         frame = self.frame_builder.build(sample, is_held_out)
         started = time.perf_counter()
         guess = self.trajectory.at(frame.timestamp) if len(self.trajectory) else self.initial_pose
         result = self.tracker.track(frame, guess, self.trajectory)  # Eq. 1-5
-        for index, T_world_camera in result.corrections.items():  # a loop closed, motion smoothed
+        for index, T_world_camera in result.corrections.items():  # loop closure, smoothing
             self.trajectory.replace(index, T_world_camera)
         self.trajectory.append(frame.timestamp, result.T_world_camera)
-        self.results.append(replace(result, corrections={}))  # they are on the trajectory: not kept twice
+        self.results.append(replace(result, corrections={}))  # the trajectory holds them
         tracked = time.perf_counter()
         if self.mapper is not None:
             self.mapper.update(frame, self.trajectory)  # Eq. 6-16

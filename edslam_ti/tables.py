@@ -1,7 +1,7 @@
-"""Text files of numbers, row by row: poses, times, calibrations.
+"""Reads text files of numbers, row by row: poses, times, calibrations.
 
-`#` begins a comment; a byte-order mark, Windows' and old Mac's line ends, blank lines and bytes of another
-encoding in comments are passed over. Messages name the line as an editor counts it.
+`#` begins a comment. A byte-order mark, Windows' and old Mac's line ends, blank lines and bytes of another
+encoding in comments are ignored. Messages number lines as an editor does.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 
 from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 
-LARGEST = 1e20  # nanoseconds since 1970 are 2e18; nothing that is measured is larger
+LARGEST = 1e20  # nanoseconds since 1970 are 2e18; no measurement is larger
 LARGEST_FILE = 2_000_000_000  # bytes of text
 
 
@@ -50,7 +50,7 @@ def read_table(path: Path, columns: int, line: str) -> Table:
 def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of every line that holds more than a comment.
 
-    `expected` says in a message what the file is for.
+    `expected` describes the file in messages.
     """
     if not path.is_file():
         raise FileNotFoundError(plain(f"{path} not found; {expected}", LONGEST_MESSAGE))
@@ -62,7 +62,7 @@ def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise DataError(f"{path}: {expected}, got text in UTF-16; save it as UTF-8")
-    # Bytes of another encoding stay recognisable in file names, and matter nowhere else but in comments.
+    # Bytes of another encoding are preserved, because file names may contain them.
     content = data.decode("utf-8-sig", "surrogateescape").replace("\r\n", "\n").replace("\r", "\n")
     for number, text in enumerate(content.split("\n"), start=1):
         if "\0" in text:

@@ -1,4 +1,4 @@
-"""A camera path: key poses over time, interpolated along geodesics (Eq. 9), read and written as TUM."""
+"""A camera path: poses over time, interpolated along geodesics (Eq. 9), read and written as TUM files."""
 
 import bisect
 import logging
@@ -16,7 +16,7 @@ from edslam_ti.geometry import interpolate, rotation_angle_deg
 from edslam_ti.output import atomic_file
 from edslam_ti.tables import read_table
 
-SHORTEST_QUATERNION, LONGEST_QUATERNION = 0.1, 10.0  # norms; files of few decimals are not exactly of 1
+SHORTEST_QUATERNION, LONGEST_QUATERNION = 0.1, 10.0  # norms; with few decimals they are not exactly 1
 FARTHEST = 1e7  # m from the origin: map coordinates (UTM) end there
 SAME_PLACE = 0.05  # m, entries of rotation matrices: coarse stamps repeat while the camera moves
 
@@ -49,7 +49,7 @@ class Trajectory:
         return np.array(self._poses).reshape(-1, 4, 4)
 
     def pose(self, index: int) -> np.ndarray:  # [4, 4]
-        """Return key pose `index`; negative counts from the end."""
+        """Return pose `index`; negative indices count from the end."""
         return self._poses[index]
 
     def index_of(self, timestamp: float) -> int:
@@ -111,7 +111,7 @@ class Trajectory:
         return Trajectory(timestamps, interpolate(poses[k], poses[k + 1], fraction).numpy())
 
     def spread(self, distance: float, angle: float) -> list[np.ndarray]:  # [4, 4] each
-        """Return poses more than `distance` metres or `angle` degrees apart along the path, and the last."""
+        """Return poses more than `distance` metres or `angle` degrees apart on the path, and the last one."""
         chosen = self._poses[:1]
         for T in self._poses[1:]:
             motion = np.linalg.inv(chosen[-1]) @ T
@@ -128,7 +128,7 @@ class Trajectory:
 
 
 class PathDraft:
-    """A trajectory with one more pose at its end, and corrections that are not on it yet."""
+    """A trajectory with one more pose at its end, and corrections that are not applied yet."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -139,7 +139,7 @@ class PathDraft:
         return len(self.trajectory) + 1
 
     def pose(self, index: int) -> np.ndarray:  # [4, 4]
-        """Return a frame's pose as it is corrected; `index` counts from the first frame."""
+        """Return a frame's corrected pose; `index` counts from the first frame."""
         if index == len(self.trajectory):
             return self.newest
         return self.corrections[index] if index in self.corrections else self.trajectory.pose(index)
@@ -155,8 +155,8 @@ class PathDraft:
 def write_tum(trajectory: Trajectory, path: Path, time_offset: float = 0.0) -> None:
     """Write lines `t tx ty tz qx qy qz qw` (seconds, metres, camera-to-world).
 
-    `time_offset` seconds are added to every stamp, in decimals: stamps since the epoch come out to the
-    nanosecond, which float64 seconds do not hold.
+    `time_offset` seconds are added to every stamp in decimal arithmetic, so that stamps since the epoch are
+    exact to the nanosecond, which float64 seconds are not.
     """
     offset = Decimal(time_offset)
     with atomic_file(path) as temporary, temporary.open("w") as file:
@@ -170,7 +170,7 @@ def write_tum(trajectory: Trajectory, path: Path, time_offset: float = 0.0) -> N
 def read_tum(path: Path, notes: list[str] | None = None) -> Trajectory:
     """Read a TUM trajectory, lines `t tx ty tz qx qy qz qw`; '#' begins a comment.
 
-    What `in_order` mends is appended to `notes`, a line each; without such a list it goes to the log.
+    A line for each repair by `in_order` is appended to `notes`; without such a list it goes to the log.
     Raises `FileNotFoundError` or `DataError`.
     """
     if not path.is_file():
@@ -203,10 +203,10 @@ def in_order(
     lines: np.ndarray,  # [N] of the file, for messages
     path: Path,
 ) -> tuple[Trajectory, list[str]]:
-    """Return the path with its rows sorted by time and repeated stamps left out, and notes that say so.
+    """Return the path sorted by time without repeated stamps, and a note for each repair.
 
-    Raises `DataError` for two paths in one file (second poses elsewhere for many stamps, or a path that
-    sorting makes longer), and for positions that no camera reaches.
+    Raises `DataError` for two paths in one file (many stamps have a second pose elsewhere, or sorting makes
+    the path longer), and for positions that no camera reaches.
     """
     position = poses[:, :3, 3]
     far = np.abs(position).max(1) > FARTHEST

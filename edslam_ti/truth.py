@@ -1,9 +1,9 @@
-"""Where a true path is known: at its own stamps, and between them as far as it can be interpolated.
+"""Where a true path is known: at its stamps, and between them where interpolation is accurate enough.
 
-A true path has holes (markers hidden, a logger that stalls) and now and then a pose that cannot be. Between
-two of its stamps, h apart, the error of Eq. 9 at a fraction u of the way is at most a u (1 - u) h^2 / 2, with
-a the acceleration. How large a h^2 / 8 is in a hole, the path itself tells: holes as long are tried at many
-places beside the real one, where the path is known, and over the whole path.
+A true path has gaps (markers hidden, a logger that stalls) and sometimes an impossible pose. Between two
+stamps, h apart, the error of Eq. 9 at a fraction u of the way is at most a u (1 - u) h^2 / 2, with a the
+acceleration. To estimate a h^2 / 8 inside a gap, artificial gaps ("holes") of the same length are tried where
+the path is known: at many places near the real one and over the whole path.
 """
 
 import itertools
@@ -15,24 +15,27 @@ from scipy.spatial.transform import Rotation
 from edslam_ti.trajectory import Trajectory
 
 AT_A_STAMP = 1e-6  # s: stamps are microseconds in most files
-OWN_RATE = 1.5  # median steps: longer ones are holes
-LONGEST_STEP = 0.5  # s: nothing that is carried by hand or drives is interpolated over longer ones
-POSSIBLE_ERROR = 2e-4  # m; what is counted is usually wrong by half of it: a tenth of an ATE of 0.1 cm
+OWN_RATE = 1.5  # median steps: longer steps are holes
+LONGEST_STEP = 0.5  # s: motion of hands and vehicles cannot be interpolated over longer steps
+POSSIBLE_ERROR = 2e-4  # m; accepted poses are usually wrong by half of it: a tenth of an ATE of 0.1 cm
 POSSIBLE_TURN = np.radians(0.05)
-TRIED_BESIDE, TRIED_IN_ALL = 16, 512  # holes that are tried for one hole, on each side and over the path
-CONSIDERED = 3.0  # lengths of the hole: so far from it holes are tried
-NEARLY_ALL = 90  # percentile of the errors of the holes beside it: one of ten may be noise
-USUAL = 75  # percentile of the errors over the whole path: motion may begin or change inside a hole
+TRIED_BESIDE, TRIED_IN_ALL = 16, 512  # number of tried holes for one hole, on each side and over the path
+CONSIDERED = 3.0  # lengths of the hole: up to this distance holes are tried on each side
+NEARLY_ALL = 90  # percentile of the errors of nearby tried holes: one in ten may be noise
+USUAL = 75  # percentile of the errors over the whole path: motion may start or change inside a hole
 
 FARTHEST = 1e7  # m from the origin: map coordinates (UTM) end there
-SMALLEST_JUMP, SMALLEST_FLIP = 0.02, np.radians(10.0)  # m, rad between stamps that motion does not explain
-HARDEST_PUSH, HARDEST_TWIST = 100.0, 2000.0  # m/s^2, rad/s^2: cameras of robots and hands stay below
-UNUSUAL = 30.0  # times what motion between stamps usually changes by
+SMALLEST_JUMP, SMALLEST_FLIP = (
+    0.02,
+    np.radians(10.0),
+)  # m, rad: smaller steps are never jumps
+HARDEST_PUSH, HARDEST_TWIST = 100.0, 2000.0  # m/s^2, rad/s^2: cameras on robots and in hands stay below
+UNUSUAL = 30.0  # times the usual change of motion between stamps
 FASTER = 10.0  # times the usual speed
 
 
 def true_poses_at(truth: Trajectory, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the true poses [N, 4, 4] at times [N] (s), NaN where they are not known, and where they are [N].
+    """Return the true poses [N, 4, 4] at times [N] (s), NaN where unknown, and whether they are known [N].
 
     A pose is known at a stamp of the truth, and between two where `TruePath` says so.
     """
@@ -40,7 +43,7 @@ def true_poses_at(truth: Trajectory, times: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def true_path(truth: Trajectory) -> "TruePath":
-    """Return what is known of a truth; the answer is kept as long as the truth has as many poses."""
+    """Return the `TruePath` of a truth; it is cached until the number of poses changes."""
     kept = _KEPT.get(truth)
     if kept is None or kept[0] != len(truth):
         kept = _KEPT[truth] = (len(truth), TruePath(truth))
@@ -51,30 +54,30 @@ _KEPT: "weakref.WeakKeyDictionary[Trajectory, tuple[int, TruePath]]" = weakref.W
 
 
 class TruePath:
-    """A true path without impossible poses, and where between its stamps it is known.
+    """A true path without impossible poses, and the times between its stamps at which it is known.
 
-    It is known between stamps at most 1.5 median steps apart: that is its own rate, which is taken as good
-    enough. In a longer step it is known where interpolation cannot be wrong by more than 0.01 cm or 0.02
-    degrees, going by holes of that length tried beside it. It is known nowhere in a step of more than 0.5 s.
+    It is known between stamps at most 1.5 median steps apart: its own rate is assumed to suffice. In a longer
+    step it is known where interpolation is wrong by at most `POSSIBLE_ERROR` and `POSSIBLE_TURN`, estimated
+    from holes of that length tried nearby. It is unknown in steps of more than 0.5 s.
     """
 
     def __init__(self, truth: Trajectory) -> None:
         is_jump = impossible_poses(truth)
         stamps, poses = truth.timestamps, truth.poses
-        self.jumps = stamps[is_jump]  # [J] s, stamps whose poses cannot be
+        self.jumps = stamps[is_jump]  # [J] s, stamps with impossible poses
         self.jump_lengths = _jump_lengths(poses[:, :3, 3], is_jump)  # [J] m
         self.path = Trajectory(stamps[~is_jump], poses[~is_jump]) if is_jump.any() else truth
         self.stamps = self.path.timestamps  # [T] s
         self.steps = np.diff(self.stamps)  # [T - 1] s
         self.median_step = float(np.median(self.steps)) if len(self.steps) else 0.0
-        # Five decimals of a second are lost in stamps since the epoch: equal steps differ by microseconds.
+        # Stamps since the epoch are rounded: equal steps differ by microseconds.
         self.own_rate = min(OWN_RATE * self.median_step, LONGEST_STEP) + AT_A_STAMP
         self._positions = self.path.poses[:, :3, 3]
         self._quaternions = _continuous_quaternions(self.path.poses)
         self._errors: dict[int, tuple[float, float]] = {}  # m and rad in the middle of a hole, by its step
 
     def poses_at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the poses [N, 4, 4] at times [N], NaN where they are not known, and where they are [N]."""
+        """Return the poses [N, 4, 4] at times [N], NaN where unknown, and whether they are known [N]."""
         times = np.asarray(times, np.float64)
         is_known = self.is_known(times)
         poses = np.full((len(times), 4, 4), np.nan)
@@ -83,15 +86,15 @@ class TruePath:
         return poses, is_known
 
     def pose_at(self, time: float) -> np.ndarray | None:  # [4, 4]
-        """Return the pose at one time, None where it is not known."""
+        """Return the pose at one time; None: unknown."""
         return self.path.at(time) if self.is_known(np.array([time]))[0] else None
 
     def likely_pose_at(self, time: float) -> np.ndarray:  # [4, 4]
-        """Return a pose even in a hole: between those before and after it, or the first or last one."""
+        """Return a pose even inside a hole: interpolated across it, or the first or last pose."""
         return self.path.at(float(np.clip(time, *self.stamps[[0, -1]])))
 
     def is_known(self, times: np.ndarray) -> np.ndarray:  # [N] s -> [N] bool
-        """Return at which times the pose is known."""
+        """Return whether the pose is known at each time."""
         stamps, steps = self.stamps, self.steps
         if len(stamps) == 0 or len(times) == 0:
             return np.zeros(len(times), bool)
@@ -109,15 +112,15 @@ class TruePath:
         return known
 
     def error_at_own_rate(self) -> float:  # m
-        """Return how wrong the interpolated position usually is midway between two stamps.
+        """Return the usual error of the interpolated position midway between two stamps.
 
-        A hole of two steps is wrong by four times as much in its middle, where a stamp tells.
+        In a hole of two steps the error in the middle is four times as large, and the stamp there shows it.
         """
         metres, _ = self._errors_of_holes(self._spread(2 * self.median_step), 2 * self.median_step)
         return float(np.median(metres)) / 4 if len(metres) else float("nan")
 
     def holes(self, start: float, end: float) -> list[tuple[float, float]]:  # s
-        """Return the times from `start` to `end` where the path is not known, a hole at a time."""
+        """Return the holes (start, end) between `start` and `end`, where the path is unknown."""
         stamps = self.stamps[(self.stamps > start) & (self.stamps < end)]
         bounds = np.concatenate([[start], stamps, [end]])
         found = [(float(a), float(b)) for a, b in itertools.pairwise(bounds) if b - a > self.own_rate]
@@ -145,15 +148,15 @@ class TruePath:
         return metres, radians
 
     def _spread(self, length: float) -> np.ndarray:  # s
-        """Return times spread over the path's stamps, at which holes of a length can be tried."""
+        """Return evenly spaced stamps of the path, at which holes of a length can be tried."""
         chosen = np.linspace(0, len(self.stamps) - 1, min(len(self.stamps), TRIED_IN_ALL)).round()
         times: np.ndarray = self.stamps[chosen.astype(int)]
         return times[(times >= self.stamps[0] + length / 2) & (times <= self.stamps[-1] - length / 2)]
 
     def _errors_of_holes(self, middles: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the errors (m, rad) in the middle of holes of a length, for those middles that can be tried.
+        """Return the errors (m, rad) in the middle of holes of a length, for the middles that can be tried.
 
-        A hole can be tried where the path is known, at its own rate, at both ends and in the middle.
+        A hole can be tried if the path is known at its own rate at both ends and in the middle.
         """
         around = middles + length * np.array([[-0.5], [0.0], [0.5]])  # [3, N]
         k = np.clip(np.searchsorted(self.stamps, around - AT_A_STAMP, side="right") - 1, 0, None)
@@ -175,15 +178,15 @@ class TruePath:
         return np.stack([np.interp(times, self.stamps, column) for column in values.T], -1)
 
 
-# --- poses that cannot be ---
+# --- impossible poses ---
 
 
 @np.errstate(over="ignore")  # whatever a file holds
 def impossible_poses(truth: Trajectory) -> np.ndarray:  # [T] bool
-    """Return which poses of a truth cannot be: far from where those before and after them lead.
+    """Return which poses of a truth are impossible: far from where the poses before and after them lead.
 
-    Steps that no motion explains cut the path into pieces. From the longest piece on, forwards and backwards,
-    a piece belongs to the path if the camera can have come there from the last piece that does.
+    Steps that no motion explains cut the path into pieces. Starting at the longest piece, forwards and
+    backwards, a piece belongs to the path if the camera can get there from the last piece that does.
     """
     stamps, positions = truth.timestamps, truth.poses[:, :3, 3]
     far = ~(np.abs(positions) <= FARTHEST).all(1)
@@ -228,7 +231,7 @@ def impossible_poses(truth: Trajectory) -> np.ndarray:  # [T] bool
 
 
 class _Limit:
-    """How far a step may be from that before or after it, as motion can explain, by the time it takes."""
+    """The largest difference between successive steps that motion can explain, as a function of time."""
 
     def __init__(
         self,
@@ -241,11 +244,11 @@ class _Limit:
         usual = UNUSUAL * float(np.percentile(surprise / steps**2, 90))
         self._smallest, self._acceleration = smallest, max(hardest, 2 * usual)
         fastest = FASTER * float(np.percentile(length / steps, 90))
-        # Two turns by 180 degrees are alike, but too fast.
+        # Two successive turns by 180 degrees do not differ, but are too fast.
         self.is_passed = (surprise > self.at(steps)) | (length > fastest * steps + self.at(steps))  # [S] bool
 
     def at(self, step: np.ndarray | float) -> np.ndarray:
-        """Return it for steps in seconds."""
+        """Return the limit for steps in seconds."""
         return np.maximum(self._smallest, self._acceleration / 2 * np.square(step))
 
 
@@ -254,7 +257,7 @@ def _turns(before: np.ndarray, after: np.ndarray) -> np.ndarray:  # [S, 3, 3] ea
 
 
 def _surprise(moved: np.ndarray, steps: np.ndarray) -> np.ndarray:  # [S, 3], [S] -> [S]
-    """Return how far each motion is from that of the step before or after, whichever is more alike."""
+    """Return how far each motion is from that of the step before or after, whichever is nearer."""
     velocity = moved / steps[:, None]
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)  # [S - 1]
     edge = np.array([np.inf])
@@ -263,7 +266,7 @@ def _surprise(moved: np.ndarray, steps: np.ndarray) -> np.ndarray:  # [S, 3], [S
 
 
 def _jump_lengths(positions: np.ndarray, is_jump: np.ndarray) -> np.ndarray:  # [T, 3], [T] -> [J] m
-    """Return how far impossible poses are from the possible one before them (else the first one)."""
+    """Return the distance of impossible poses from the last possible pose before them (else the first)."""
     kept = np.flatnonzero(~is_jump)
     if len(kept) == 0:
         return np.full(int(is_jump.sum()), np.inf)

@@ -1,4 +1,4 @@
-"""Following a run on a screen: what a viewer is, and an Open3D window."""
+"""Shows a run on a screen: the interface of viewers, and an Open3D window."""
 
 import os
 import sys
@@ -22,13 +22,13 @@ FOCAL = 625.0  # pixels: 60 degrees from top to bottom
 
 
 class Viewer(Protocol):
-    """Shows a run while it goes on."""
+    """Shows a run in progress."""
 
     def update(self, trajectory: Trajectory, mapper: Mapper | None, camera: Camera) -> None:
         """Show the state of the run after a frame, and return at once."""
 
     def close(self) -> None:
-        """Stop showing: the run is saved."""
+        """Stop showing, because the run has been saved."""
 
 
 class NoViewer:
@@ -83,11 +83,11 @@ class Open3dViewer:
         self._window.update_renderer()
 
     def close(self) -> None:
-        """Take the window away."""
+        """Close the window."""
         self._window.destroy_window()
 
     def _look_from(self, T_world_camera: np.ndarray) -> None:
-        """Put the eye where a camera stood, looking its way."""
+        """Set the view of the window to that of a camera."""
         parameters = self._o3d.camera.PinholeCameraParameters()
         centre = ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
         parameters.intrinsic = self._o3d.camera.PinholeCameraIntrinsic(WIDTH, HEIGHT, FOCAL, FOCAL, *centre)
@@ -113,7 +113,7 @@ def check_display() -> None:
 
 
 def _keyframe_indices(mapper: Mapper | None, num_frames: int) -> list[int]:
-    """Return the frames a map is built on; every tenth for a map without keyframes."""
+    """Return the map's keyframes; every tenth frame for a map without keyframes."""
     keyframes = [] if mapper is None else mapper.keyframe_indices()
     return keyframes or list(range(0, num_frames, FRUSTUM_EVERY))
 

@@ -1,4 +1,4 @@
-"""Taichi kernels of ED-SLAM and their torch wrappers; knows arrays, not SLAM."""
+"""Taichi kernels of ED-SLAM and their torch wrappers. They work on arrays and know nothing of SLAM."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ __all__ = ["init"]
 
 
 def __getattr__(name: str) -> Any:
-    """Load `init` when it is first used: a module of constants can be imported without Taichi."""
+    """Load `init` on first use, so that a module of constants can be imported without Taichi."""
     if name in __all__:
         from edslam_ti.kernels import runtime
 

@@ -1,17 +1,17 @@
-"""The image from which the observed changes of brightness follow: robust least squares, matrix-free.
+"""Solves for the image that explains the measured changes of brightness: matrix-free robust least squares.
 
-With E_k the change of log brightness measured from the image l until time k, the image at k is l + E_k.
-What is at pixel u at time j and at x(u) at time k has one brightness, which gives the equation
-l(u) - l(x(u)) = E_k(x(u)) - E_j(u), without l where the image at j or k is known. A l = b are all of them,
-and the image minimises
+Let E_k be the change of log brightness measured from the image l until time k. The image at k is l + E_k. A
+point seen at pixel u at time j and at x(u) at time k has the same brightness in both images, which gives the
+equation l(u) - l(x(u)) = E_k(x(u)) - E_j(u). If the image at j or k is known, its l drops out. All equations
+together are A l = b, and the image minimises
 
     sum of rho((A l - b)_i) + lambda |l - prior|^2,    rho: Huber's function
 
 by conjugate gradients on the normal equations A^T W A + lambda, preconditioned by their diagonal. The
-prior's residuals give the weights W: solving again from a solution reweights. A row of A is 1 at u and
-minus four bilinear weights at the corners around x(u): read and written as one vector, from and to an
-image of four-vectors. One worker takes the rows in their order, so that sums are the same for any number
-of workers.
+residuals of the initial value give the weights W; solving again from a solution reweights. A row of A is 1 at
+u and minus four bilinear weights at the corners around x(u). The four corners are read and written as one
+vector, in an image of four-vectors. One worker processes the rows in order, so that sums are the same for any
+number of workers.
 """
 
 import functools
@@ -32,10 +32,10 @@ OCCLUDED, OCCLUDED_MARGIN = 0.03, 0.02
 # A point lies on the measured surface if all depths around it differ from its own by less than this share.
 # Two-sided and strict, for `is_strict`: neither nearer points nor missing depth are accepted.
 SAME_SURFACE = 0.03
-BORDER = 1.001  # pixels; all four corners are in the image
-CONVERGED = 1e-14  # of the squared residual, preconditioned, at the start
-NO_DEPTH = -1.0  # of all pixels of an image without depth, where any surface counts as seen
-KEPT_PAIRS = 32  # the memory for so many at most is kept: fresh costs as much as what is computed in it
+BORDER = 1.001  # pixels; keeps all four corners inside the image
+CONVERGED = 1e-14  # share of the initial squared (preconditioned) residual
+NO_DEPTH = -1.0  # depth of all pixels of an image without depth, in which any surface counts as seen
+KEPT_PAIRS = 32  # memory for up to this many pairs is kept: allocating costs as much time as computing
 
 _Corners = ti.types.vector(
     4
@@ -54,12 +54,12 @@ def _find_rows(
     projections: ti.types.ndarray(ndim=2),  # [K, 12] rows of [C R C^-1 | C t], C the camera matrix
     changes: ti.types.ndarray(ndim=1),  # [V H W]
     depths: ti.types.ndarray(ndim=1),  # [V H W] metres, 0 = missing
-    is_known: ti.types.ndarray(ti.u8, ndim=1),  # [V] the change is all there is
+    is_known: ti.types.ndarray(ti.u8, ndim=1),  # [V] the change is the whole log brightness
     height: ti.i32,
     width: ti.i32,
     is_strict: ti.i32,
     num_workers: ti.i32,
-    # outputs, a pair's rows from k H W on
+    # outputs; rows of pair k start at k H W
     count: ti.types.ndarray(ti.i32, ndim=1),  # [K] rows of a pair
     place: ti.types.ndarray(ti.i64, ndim=1),  # [K H W] pixel u + 2^32 times the one right below x(u)
     bilinear: ti.types.ndarray(ndim=2),  # [K H W, 4]
@@ -119,7 +119,7 @@ def clear(image: ti.template()):  # four-vectors
 
 @ti.func
 def folded(image: ti.template(), p, width):
-    """What the four-vectors right below hold for pixel p."""
+    """The sum of what the four vectors around pixel p hold for it."""
     last = p + width + 1
     return image[last][0] + image[last - 1][1] + image[last - width][2] + image[last - width - 1][3]
 
@@ -171,7 +171,7 @@ def _solve(
     image_lanes: lanes(1),
 ):
     ti.loop_config(serialize=True)
-    for _ in range(1):  # what is outermost may be split
+    for _ in range(1):  # Taichi may split the outermost loop among workers
         n, num_lanes = around.shape[0] - width - 1, level_lanes.shape[0]
         # r = A^T W (b - A l) + lambda (prior - l), and the diagonal
         unfold(level, width, around)
@@ -188,7 +188,7 @@ def _solve(
                 size = ti.select(error < 0, 0.0 - error, error)
                 robust = ti.select((is_robust > 0) & (size > huber), huber / size, 1.0)
                 weight[row] = robust
-                # One of the corners may be u itself: the square is that of 1 - its weight.
+                # One of the corners may be u itself: then the squared entry is (1 - its weight)^2.
                 twice = (
                     w[0] * (c - width - 1 == u)
                     + w[1] * (c - width == u)
@@ -242,15 +242,15 @@ def _solve(
 
 
 class ChangeImage(NamedTuple):
-    """What has been measured at one time."""
+    """The measurement at one time."""
 
-    change: np.ndarray  # [H, W] log brightness less the image that is looked for
+    change: np.ndarray  # [H, W] log brightness minus the unknown image
     depth: np.ndarray | None  # [H, W] metres, 0 = missing
-    is_known: bool = False  # the change is all the log brightness there is
+    is_known: bool = False  # `change` is the whole log brightness
 
 
 class Pair(NamedTuple):
-    """Two images: every pixel with depth of the first gives an equation where it is seen in the second."""
+    """Two images: each pixel with depth in the first gives an equation if the second sees its point."""
 
     first: int  # index of an image
     second: int
@@ -277,18 +277,18 @@ def solve_brightness_image(
     images: Sequence[ChangeImage],  # V of them
     pairs: Sequence[Pair],  # K of them
     intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy, pixels
-    prior: np.ndarray,  # [H, W] log brightness; stays where nothing was observed
+    prior: np.ndarray,  # [H, W] log brightness; kept where nothing was observed
     prior_weight: float,  # lambda
     huber: float,  # log brightness
     iterations: int,  # of conjugate gradients
-    is_robust: Sequence[bool],  # solutions, each from the one before, the first from the prior
+    is_robust: Sequence[bool],  # one per solve; each starts from the one before, the first from the prior
     is_strict: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:  # [H, W], [H, W] bool
-    """Return the log brightness, and which of its pixels stand in an equation.
+    """Return the log brightness, and which of its pixels occur in an equation.
 
-    Robust solutions: equations that the solution before fits badly count less, else all alike. Hidden points
-    are left out; with `is_strict` also those where the depth of the second image is missing or another one.
-    One solution at a time: they share their memory.
+    A robust solve gives less weight to equations that the previous solution fits badly; other solves weight
+    all alike. Occluded points are left out; with `is_strict` also points where the second image's depth is
+    missing or differs. Do not call it from two threads at once: calls share their memory.
     """
     if prior_weight <= 0:
         raise ValueError(f"prior_weight: expected a positive weight, got {prior_weight}")
@@ -339,7 +339,7 @@ def _projections(poses: Sequence[np.ndarray], intrinsics: tuple[float, float, fl
 
 
 def compile_kernels() -> None:
-    """Compile what a solution needs, so that the first frames of a sequence need not wait for it."""
+    """Compile the kernels of a solve, so that the first frames of a sequence do not wait for it."""
     image = ChangeImage(np.ones((3, 3), np.float32), np.ones((3, 3), np.float32))
     pair = Pair(0, 0, np.eye(4))
     solve_brightness_image([image], [pair], (1.0, 1.0, 0.0, 0.0), image.change, 1.0, 1.0, 1, [False])

@@ -1,4 +1,4 @@
-"""What a tile's or a block's list of Gaussians draws (Eq. 8), and its gradients: functions of the kernels.
+"""Compositing of the Gaussians in a tile's or a block's list (Eq. 8), and its gradients.
 
 `draw` and `draw_backward` take a block of pixels, as the lanes of vectors (kernels.rasterization), or a
 single pixel (kernels.rasterization_gpu); the maths is in kernels.rasterization.
@@ -44,7 +44,7 @@ def lane_rows():
 
 @ti.func
 def log_255_alpha(record: ti.template(), at, dx, dy):
-    """Not negative inside the ellipse of a record, at the distance d from its mean."""
+    """log(255 alpha) at distance d from a record's mean; not negative inside its ellipse."""
     along_x = record[at, HALF_K_XX] * dx + record[at, K_XY] * dy
     return record[at, EXTENT] - dx * along_x - record[at, HALF_K_YY] * dy * dy
 
@@ -61,9 +61,9 @@ def list_blocks(
     items: ti.template(),  # [workers, blocks, longest]
     C: ti.template(),
 ):  # fmt: skip
-    """Copy the records of a tile to where they are neighbours, and list for each block those it draws."""
+    """Copy the records of a tile into contiguous memory, and list for each block those it draws."""
     base = w * items.shape[2]
-    for j in range(past - first):  # a loop this short waits for many records at once
+    for j in range(past - first):  # so short a loop lets the CPU load many records at once
         g = pairs[first + j, 0]
         for k in ti.static(range(record_size(C) // SUMS)):
             near[base + j, k] = records[g, k]
@@ -133,7 +133,7 @@ def draw(
 
 @ti.func
 def place_of(pairs: ti.template(), first, items: ti.template(), w, block, n, is_block: ti.template()):
-    """Where the n-th record of a list is, and which pair it belongs to."""
+    """The position of the n-th record of a list, and the pair it belongs to."""
     at, pair = 0, first + n
     if ti.static(is_block):
         j = items[w, block, n]
@@ -157,7 +157,7 @@ def draw_backward(
     """Add to the gradients of the records."""
     # With q_i = f_i . dF for the features f = (depth, colours), the loss depends on alpha_i as
     #   dL/dalpha_i = T_i (q_i - B_i),   B_{i-1} = B_i + alpha_i (q_i - B_i),   B_end = -dA:
-    # alpha_i scales its own weight and takes as much from what is behind it, whose part in the loss is B_i.
+    # alpha_i scales its own weight and attenuates everything behind it, whose part of the loss is B_i.
     # T_i is recovered backwards from T_end by dividing by 1 - alpha_i. With v = alpha dL/dalpha:
     #   d mean = K sum v d,   dK = -1/2 sum v d d^T,   d opacity = sum v / o.
     T, last_drawn = transmittance[i], last[i]
@@ -177,7 +177,7 @@ def draw_backward(
         for k in ti.static(range(1 + C)):
             q += record[at, FEATURES + k] * grad_feature[k]
         behind += alpha * q
-        v = ti.select(raw < MAX_ALPHA, weight * q, 0.0)  # min() passes no gradient where it cuts
+        v = ti.select(raw < MAX_ALPHA, weight * q, 0.0)  # min() has no gradient where it clips
         v_x, v_y = v * dx, v * dy
         part = (
             [v, v_x, v_y, v_x * dx, v_x * dy, v_y * dy]

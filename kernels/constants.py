@@ -1,3 +1,3 @@
-"""Numbers that several kernels and their callers share; it loads neither torch nor an engine."""
+"""Constants that several kernels and their callers share; this file loads neither torch nor an engine."""
 
-NEAR = 0.05  # metres: a camera measures and draws nothing nearer
+NEAR = 0.05  # metres: points nearer to a camera are neither measured nor drawn

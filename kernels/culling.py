@@ -1,4 +1,4 @@
-"""Which Gaussians of a map may show in a view: an image needs nothing of the others."""
+"""Selects the Gaussians of a map that may show in a view."""
 
 import math
 
@@ -20,7 +20,7 @@ def _reaches(
     f,
     sigma_over_z,
 ):
-    """Whether a ball at that offset, as large as the Gaussian's largest axis, can reach the image (Eq. 7)."""
+    """Whether a ball at this offset, as large as the Gaussian's largest axis, can reach the image (Eq. 7)."""
     variance = (f * f + offset * offset) * sigma_over_z * sigma_over_z + LOW_PASS
     reach = 1.0 + REACH * ti.sqrt(variance)
     return (offset + principal_point > -reach) & (offset + principal_point < size - 1 + reach)
@@ -28,7 +28,7 @@ def _reaches(
 
 @ti.func
 def _is_near(position, size):
-    """Whether rendering does not cull what is at that pixel."""
+    """Whether a mean at this pixel is near enough to the image for rendering not to cull it."""
     margin = 1.0 + MARGIN * size
     return (position > -margin) & (position < size - 1 + margin)
 

@@ -1,4 +1,4 @@
-"""A depth image averaged with others that measured the same surfaces from elsewhere."""
+"""Averages a depth image with others that measured the same surfaces from other poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from edslam_ti.kernels.runtime import check_shape
 @ti.kernel
 def _average_depth(
     # inputs
-    points: lanes(2),  # [blocks, 4] X, Y, Z (metres, 0 = missing) and a value that does not matter
+    points: lanes(2),  # [blocks, 4] X, Y, Z (metres, 0 = missing) and an unused value
     others: ti.types.ndarray(ndim=1),  # [K H W] metres, 0 = missing
     height: ti.i32,
     width: ti.i32,
@@ -91,7 +91,7 @@ class DepthAgreement:
     sigma: float  # metres: the noise's standard deviation is sigma + sigma_2 z^2
     sigma_2: float  # 1/m
     num_sigmas: float = 4.0
-    share: float = 0.05  # of the depth, and no more
+    share: float = 0.05  # of the depth; an upper limit
 
 
 def average_depth(
@@ -101,7 +101,7 @@ def average_depth(
     rays: PixelRays,  # of the camera of all these images
     agreement: DepthAgreement,
 ) -> np.ndarray:  # [H, W] metres, 0 = missing
-    """Return a depth image averaged along its rays with others that agree."""
+    """Return a depth image averaged along its rays with the other images where they agree."""
     for other in others:
         check_shape("others", other, depth.shape)
     if len(others) == 0:
@@ -119,6 +119,6 @@ def average_depth(
 
 
 def compile_kernels() -> None:
-    """Compile what averages need, so that the first frames of a sequence need not wait for it."""
+    """Compile the averaging kernels, so that the first frames of a sequence do not wait for it."""
     image, rays = np.zeros((1, 1), np.float32), PixelRays((1, 1), (1.0, 1.0, 0.0, 0.0))
     average_depth(image, [image], [np.eye(4)], rays, DepthAgreement(1.0, 1.0))

@@ -1,7 +1,7 @@
-"""The one file that imports Taichi, or the fork of it that EDSLAM_ENGINE names: `taichi` or `quadrants`.
+"""The only file that imports the engine: Taichi or its fork, as EDSLAM_ENGINE says (`taichi`, `quadrants`).
 
-Kernels write `from edslam_ti.kernels.engine import ti`. The choice holds for the whole process and is made
-when this file is first imported. Both engines share the API that the kernels use.
+Kernels write `from edslam_ti.kernels.engine import ti`. The first import of this file makes the choice for
+the whole process. Both engines share the API that the kernels use.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ ENGINES = {  # how each is installed
 
 
 def _load(name: str) -> ModuleType:
-    """Return the engine's module, loaded without its banner; raise ImportError with what to do."""
+    """Return the engine's module, loaded without its banner; an ImportError says what to do."""
     if name not in ENGINES:
         raise ImportError(f"EDSLAM_ENGINE: expected {' or '.join(map(repr, ENGINES))}, got {name!r}")
     try:
@@ -36,7 +36,7 @@ def _load(name: str) -> ModuleType:
 def _without_banner(name: str) -> Iterator[None]:
     """Import without a printed banner, and leave the environment as it was.
 
-    Engines look at the stream of standard output when they are imported, so it is not redirected.
+    Engines inspect standard output when they are imported, so it must not be redirected.
     """
     variable = f"ENABLE_{name.upper()}_HEADER_PRINT"
     if variable in os.environ:

@@ -28,7 +28,7 @@ NEVER = -(2**62)  # time of the last event of a pixel that has fired none
 
 @dataclass(frozen=True)
 class EventSensorState:
-    """Memory of every pixel; advanced in place by `simulate_events`."""
+    """State of every pixel; `simulate_events` advances it in place."""
 
     reference: np.ndarray  # [H, W] float64, log intensity at the last crossing
     num_crossings: np.ndarray  # [H, W] int32, crossings so far (k above)
@@ -184,7 +184,7 @@ def simulate_events(
     ends = np.cumsum(counts, dtype=np.int64).reshape(shape)
     total = int(ends[-1, -1])
     times, x, y, polarity = launch(1, ends - counts, total)
-    # Time and slot in one 64-bit key: an unstable sort of keys is a stable sort of times, ten times faster.
+    # With time and slot in one 64-bit key, an unstable sort of keys sorts times stably, ten times faster.
     slot_bits = max(int(total).bit_length(), 1)
     if (end - start).bit_length() + slot_bits > 63:
         order = np.argsort(times, kind="stable")

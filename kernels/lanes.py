@@ -1,11 +1,11 @@
-"""Sixteen values at a time: what a kernel needs to use a CPU's vector registers.
+"""Vectors of sixteen values, with which kernels use a CPU's vector registers.
 
-Taichi normally takes vectors apart into scalars, and LLVM does not put them together again. A kernel
-under `@vector_instructions` is compiled without that step: arithmetic on a `ti.Vector` of LANES numbers
-becomes vector instructions, comparisons become masks for `ti.select`, and a vector of other vectors' lanes
-becomes a shuffle. Of the operations on vectors, Taichi 1.7 then cannot compile negation, casts, `abs`,
-`rsqrt`, `exp` and `log`; CPU memory must be aligned as torch's is. `ti.min` looks out for NaN, `ti.select`
-does not: write the latter in inner loops.
+Taichi normally splits vectors into scalars, and LLVM does not join them again. A kernel under
+`@vector_instructions` is compiled without that step: arithmetic on a `ti.Vector` of LANES numbers becomes
+vector instructions, comparisons become masks for `ti.select`, and a vector of other vectors' lanes becomes a
+shuffle. Of the operations on vectors, Taichi 1.7 then cannot compile negation, casts, `abs`, `rsqrt`, `exp`
+and `log`; CPU memory must be aligned as torch's is. `ti.min` and `ti.max` do not propagate NaN: if one
+operand is NaN they return the other, which takes additional instructions. Use `ti.select` in inner loops.
 """
 
 import functools
@@ -19,15 +19,15 @@ from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import float_dtype
 
 LANES = 16
-SUMS = 8  # of lanes, made at once
-_configuration = threading.RLock()  # of the engine's settings
+SUMS = 8  # number of vectors whose lanes `sums_of` adds at once
+_configuration = threading.RLock()  # guards the engine's settings
 
 
 def vector_instructions(kernel: Callable) -> Callable:
-    """Return the kernel, compiled with fast_math and, on a CPU, so that vectors stay whole.
+    """Return the kernel, compiled with fast_math and, on a CPU, with whole vectors.
 
-    Both are settings of the whole engine, changed for the time of a launch. A lock keeps two threads from
-    launching such kernels at once; other kernels must not be launched from another thread meanwhile.
+    Both are settings of the whole engine, changed during a launch. A lock keeps two threads from launching
+    such kernels at once; another thread must not launch other kernels meanwhile.
     """
 
     @functools.wraps(kernel)
@@ -84,7 +84,7 @@ def zeros():
 
 @ti.func
 def exp(x):
-    """exp(x) = exp(x / 8)^8 for 0 <= x <= ln 256; elsewhere meaningless."""
+    """exp(x) = exp(x / 8)^8 for 0 <= x <= ln 256; undefined elsewhere."""
     coefficients = ti.static(exp_coefficients())
     value = x * coefficients[-1] + coefficients[-2]
     for k in ti.static(range(len(coefficients) - 3, -1, -1)):
@@ -96,7 +96,7 @@ def exp(x):
 
 @ti.func
 def log(x):
-    """log(x) = 16 log(x^(1/16)) for 1e-3 <= x <= 1e3; less exact farther from 1."""
+    """log(x) = 16 log(x^(1/16)) for 1e-3 <= x <= 1e3; less accurate farther from 1."""
     root = ti.sqrt(ti.sqrt(ti.sqrt(ti.sqrt(x))))
     y = (root - 1.0) / (root + 1.0)  # at most 0.22
     coefficients = ti.static(log_coefficients())
@@ -108,7 +108,7 @@ def log(x):
 
 @ti.func
 def largest(v):
-    """Largest of the lanes, by halves: `max()` takes them one after the other and looks out for NaN."""
+    """Largest of the lanes, by halves: `max()` would go through them in sequence and test for NaN."""
     parts = [v[lane] for lane in range(LANES)]
     for step in ti.static(range(LANES.bit_length() - 1)):
         half = ti.static(LANES >> (step + 1))
@@ -125,7 +125,7 @@ def split_columns(
     row: ti.template(),
     width: ti.template(),
 ):
-    """Columns of LANES rows of a table, as rows of `target`."""
+    """Write columns of LANES rows of a table as rows of `target`."""
     numbers = [source[group * width + k // LANES][k % LANES] for k in range(width * LANES)]
     for column in ti.static(range(width)):
         target[row + column, group] = ti.Vector([numbers[lane * width + column] for lane in range(LANES)])
@@ -145,7 +145,7 @@ def join_columns(
 
 @ti.func
 def _folded(a, b):
-    """The two halves of a, added, and then those of b."""
+    """The sum of the two halves of a, followed by that of b."""
     low = ti.Vector([a[k] for k in range(8)] + [b[k] for k in range(8)])
     high = ti.Vector([a[8 + k] for k in range(8)] + [b[8 + k] for k in range(8)])
     return low + high
@@ -153,7 +153,7 @@ def _folded(a, b):
 
 @ti.func
 def _quarters_added(a, b):
-    """Of two results of `_folded`: the halves of each half, added."""
+    """For two results of `_folded`, the sum of the halves of each half."""
     low = ti.Vector([v[8 * h + k] for v in (a, b) for h in range(2) for k in range(4)])
     high = ti.Vector([v[8 * h + 4 + k] for v in (a, b) for h in range(2) for k in range(4)])
     return low + high

@@ -11,14 +11,13 @@ Both residuals are divided by their standard deviation and weighted by Huber's f
 unsquared norms, and this is its smooth least-squares form. The unknown is a twist xi, order
 (translation, rotation), that updates T_b_a <- exp(xi) T_b_a.
 
-The inverse-compositional form (Baker and Matthews 2004) updates T_b_a <- T_b_a exp(xi) and takes the Jacobian
-of the patches in their own view, which stays the same, for that of the other, which it is where they align:
+The inverse-compositional form (Baker and Matthews 2004) updates T_b_a <- T_b_a exp(xi). It uses the Jacobian
+of the patches in their own view, which stays the same and equals that of the other view once they align:
 
     dr_surface/dxi = dS(surface_a, pi(exp(xi) p))/dxi,    dr_depth/dxi = d(p_z - S(depth_a, pi(p)))/dxi
 
-All patches of all directions are linearised in one launch, sixteen pixels at a time (kernels.lanes):
-points of view a and their Jacobians are vectors, only the corners of the bilinear samples are fetched
-pixel by pixel.
+One launch linearises all patches of all directions, sixteen pixels at a time (kernels.lanes). Points of view
+a and their Jacobians are vectors; only the corners of the bilinear samples are fetched pixel by pixel.
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from edslam_ti.kernels.lanes import LANES, lanes, vector_instructions, zeros
 from edslam_ti.kernels.runtime import CHUNK, check_shape, float_dtype, workers
 
 PART = 32  # blocks of LANES pixels to a partial sum: a fixed partition, the same bits for any threads
-PARTS_PER_WORKER = 24  # fewer are done before another core has woken up
+PARTS_PER_WORKER = 24  # fewer are finished before another core has woken up
 # Columns of a partial sum: 21 entries of H (upper triangle, row by row), 6 of g, then
 COST, NUM_SURFACE, NUM_DEPTH, NUM_USABLE = 27, 28, 29, 30
 SUM_SIZE = 31
@@ -41,9 +40,9 @@ FX, FY, CX, CY, MAX_DEPTH_DIFFERENCE, SURFACE_SIGMA = 12, 13, 14, 15, 16, 17
 DEPTH_WEIGHT, DEPTH_SIGMA, DEPTH_SIGMA_2, HUBER_THRESHOLD = 18, 19, 20, 21
 JOB_SIZE = 22
 POINT_SIZE = 4  # X, Y, Z, value; then, in the compositional form, both residuals' Jacobians
-# Share of the depth by which neighbouring pixels of one depth image may differ: more is an edge, and what is
-# interpolated across it lies on no surface. It compares measurements of one image; SAME_SURFACE and OCCLUDED
-# of kernels.brightness_image compare a predicted depth with measured ones.
+# Share of the depth by which neighbouring pixels of one depth image may differ. A larger difference is an
+# edge, across which interpolated depth lies on no surface. This constant compares measurements of one image;
+# SAME_SURFACE and OCCLUDED of kernels.brightness_image compare a predicted depth with measured ones.
 MAX_SLOPE = 0.05
 
 
@@ -85,7 +84,7 @@ def _extract_patches(
     pixels: ti.types.ndarray(ndim=2),  # out [P * size^2, 3]
     values: ti.types.ndarray(ndim=1),  # out [P * size^2]
 ):
-    ti.loop_config(serialize=True)  # a second core takes as long to wake up as this to run
+    ti.loop_config(serialize=True)  # waking up a second core takes as long as this loop
     for m in range(values.shape[0]):
         patch, k = m // (size * size), m % (size * size)
         x = centres[patch, 0] + k % size - size // 2
@@ -230,7 +229,7 @@ def _template_jacobians(
     depth: np.ndarray,  # [H, W] metres, 0 = missing
     intrinsics: tuple[float, float, float, float],
 ) -> np.ndarray:  # [12, M]
-    """Return dr_surface/dxi and dr_depth/dxi by central differences; 0 at borders and edges of depth."""
+    """Return dr_surface/dxi and dr_depth/dxi by central differences; 0 at borders and depth edges."""
     (height, width), (fx, fy, _, _) = surface.shape, intrinsics
     column, row = pixels[:, 0].astype(np.intp), pixels[:, 1].astype(np.intp)
     inside = (column > 0) & (column < width - 1) & (row > 0) & (row < height - 1) & (pixels[:, 2] > 0)
@@ -254,7 +253,7 @@ def _template_jacobians(
 
 @dataclass(frozen=True)
 class ResidualModel:
-    """How residuals are weighted against each other."""
+    """Weights of the residuals."""
 
     max_depth_difference: float = 0.1  # tau_d, metres
     surface_sigma: float = 0.15
@@ -266,14 +265,14 @@ class ResidualModel:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """H xi = -g for a twist xi, and what went into it."""
+    """H xi = -g for a twist xi, with the cost and the numbers of residuals."""
 
     H: np.ndarray  # [6, 6] float64
     g: np.ndarray  # [6] float64
     cost: float  # sum of robust costs
     num_surface: int  # pixels with a surface residual
     num_depth: int  # pixels with a depth residual
-    num_usable: int  # patch pixels that have depth, visible in the other view or not
+    num_usable: int  # patch pixels with depth, visible in the other view or not
 
     def __add__(self, other: "NormalEquations") -> "NormalEquations":
         return NormalEquations(
@@ -286,7 +285,7 @@ class NormalEquations:
         )
 
     def transformed(self, A: np.ndarray) -> "NormalEquations":  # [6, 6]
-        """Return the system for another unknown xi', with xi = A xi'."""
+        """Return the system for the unknown xi', with xi = A xi'."""
         return replace(self, H=A.T @ self.H @ A, g=A.T @ self.g)
 
 
@@ -318,9 +317,9 @@ class Direction:
 
 
 class Alignment:
-    """Normal equations of several directions at once, for poses that change from call to call.
+    """Computes the normal equations of several directions at once, for poses that change with every call.
 
-    Their unknown is the twist xi with T_b_a <- exp(xi) T_b_a. If the points carry the Jacobians of a template
+    The unknown is the twist xi with T_b_a <- exp(xi) T_b_a. If the points carry the Jacobians of a template
     (`is_compositional`), it is the xi with T_b_a <- T_b_a exp(xi).
     """
 
@@ -339,7 +338,7 @@ class Alignment:
             self._points = directions[0].points
         else:
             self._points = torch.empty(sum(map(len, points)), rows, LANES, dtype=float_dtype())
-            np.concatenate(points, out=self._points.numpy())  # torch.cat wakes up other cores
+            np.concatenate(points, out=self._points.numpy())  # torch.cat would wake up other cores
         self._jobs: np.ndarray = np.empty((len(directions), JOB_SIZE), _numpy_float())
         self._parts: list[slice] = []
         bounds: list[tuple[int, int, int, int]] = []
@@ -360,7 +359,7 @@ class Alignment:
         self._sums: np.ndarray = np.empty((len(bounds), SUM_SIZE), _numpy_float())
 
     def linearise(self, poses: list[np.ndarray]) -> "list[NormalEquations]":  # T_b_a [4, 4] of each direction
-        """Return the Gauss-Newton system of Eq. 5 for each direction, in the unknown that the class names."""
+        """Return the Gauss-Newton system of Eq. 5 for each direction, in the unknown named above."""
         for job, T_b_a in enumerate(poses):
             self._jobs[job, :FX] = T_b_a[:3].ravel()
         if len(self._bounds):
@@ -381,7 +380,7 @@ class Alignment:
 
 
 def compile_kernels() -> None:
-    """Compile what tracking needs, so that the first frames of a sequence need not wait for it."""
+    """Compile the kernels of tracking, so that the first frames of a sequence do not wait for it."""
     image: np.ndarray = np.zeros((2, 2), _numpy_float())
     patches = extract_patches(image, image, np.zeros((1, 2), np.int32), 1)
     intrinsics = (1.0, 1.0, 0.0, 0.0)
@@ -393,7 +392,7 @@ def _numpy_float() -> type:
     return np.float64 if float_dtype() == torch.float64 else np.float32
 
 
-# Where the entries of H stand in a partial sum.
+# Positions of the entries of H in a partial sum.
 _SYMMETRIC = np.array(
     [[min(a, b) * 6 - min(a, b) * (min(a, b) - 1) // 2 + abs(a - b) for b in range(6)] for a in range(6)]
 )

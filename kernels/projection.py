@@ -9,10 +9,10 @@ For one Gaussian with mean mu, rotation R(q) and scales s, seen from T_camera_wo
     S' = A A^T + low_pass I                       Eq. 7, with the usual low-pass filter, 0.3 px^2
     K  = S'^-1                                    the conic: alpha = o exp(-1/2 d^T K d), Eq. 8
 
-One map is projected for several views at once: Gaussian i of view v is entry v * padded + i of what follows,
-and everything after projection (sorting, lists, slots) takes the views as one. The parameters are
-stored by rows [ROWS, padded], so that on a CPU the same component of LANES Gaussians is one vector;
-on a GPU the same functions work on one Gaussian per thread.
+One map is projected into several views at once. Gaussian i of view v is entry v * padded + i of the results,
+and everything after projection (sorting, lists, slots) treats the views as one. The parameters are stored by
+rows [ROWS, padded], so that on a CPU the same component of LANES Gaussians is one vector; on a GPU the same
+functions work on one Gaussian per thread.
 """
 
 from dataclasses import dataclass
@@ -37,12 +37,12 @@ from edslam_ti.kernels.runtime import CHUNK, float_dtype, plain, workers
 LOW_PASS = 0.3  # px^2 added to the 2D covariance at full size (Kerbl et al. 2023)
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian ends where its alpha falls below this
 NOT_DRAWN = -1  # in place of the depth bits, which are positive
-MARGIN = 0.3  # of the image's size: the affine approximation is useless farther outside it
+MARGIN = 0.3  # of the image's size: farther outside, the affine approximation is useless
 BLOCK = 4  # pixels across and down that a CPU handles at once: LANES of them
-SPANS = 6  # rows of blocks for which the exact extent of an ellipse is kept; beyond, its box is
+SPANS = 6  # rows of blocks for which the exact extent of an ellipse is kept; for more rows, its box
 HALF = 4096  # a * HALF + b holds two counts of blocks in one float
-MAX_TILES = 256  # across and down: a Gaussian's first and last tile column and row fit into one integer
-SLACK = 0.01  # pixels around an ellipse, so that rounding cuts no pixel off its lists
+MAX_TILES = 256  # across and down; first and last tile column and row of a Gaussian fit into one integer
+SLACK = 0.01  # pixels around an ellipse, so that rounding removes no pixel from its lists
 PART = 32  # groups of lanes that share a partial sum of the pose gradient, added in float64
 
 # Rows of the Gaussians' parameters [ROWS + C, padded], then the colours
@@ -67,7 +67,7 @@ def record_size(channels: int) -> int:
 
 @ti.func
 def once(x):
-    """x, computed once: entries of a list are otherwise computed wherever they are used."""
+    """Return x in a variable; Taichi would otherwise compute an entry of a list at every use."""
     return x
 
 
@@ -169,7 +169,7 @@ def unpack_tiles(packed):
 def differentiate(
     # inputs
     gaussians: ti.template(), i, poses: ti.template(), fx, fy, low_pass,
-    gradient_2d: ti.template(),  # [gradient_size(C) + 1, V * n] the last row: 1 where there are any
+    gradient_2d: ti.template(),  # [gradient_size(C) + 1, V * n]; last row: 1 where any is nonzero
     # outputs
     gradient: ti.template(),  # [COLOR + C, n]
     pose_parts: ti.template(), part,  # [V, parts, 12] rows of [dR | dt], added to
@@ -298,7 +298,7 @@ def _project_forward(
     first_slot: ti.types.ndarray(ti.i32, ndim=1),  # [V * padded + 1] of every Gaussian, one slot a tile
     C: ti.template(),
 ):
-    """Project LANES Gaussians at a time into all views, and count the tiles that each of them touches."""
+    """Project LANES Gaussians at a time into all views, and count the tiles that each Gaussian touches."""
     groups = gaussians.shape[1]
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
@@ -331,7 +331,7 @@ def _project_forward(
                     half = ti.select(is_drawn, 0.5 / det, 0.0)
                     p, q, r = once(cov_yy * half), once((0.0 - 2.0) * cov_xy * half), once(cov_xx * half)
                     first = (v * groups + group) * LANES
-                    # Of each row of blocks the ellipse reaches only some.
+                    # The ellipse reaches only some blocks of each row.
                     slope = half_width * cov_xy / ti.select(is_drawn, cov_xx, 1.0)
                     for row in range(ti.min(SPANS, ti.cast(largest(rows), ti.i32))):
                         a = (top + row) * BLOCK - y
@@ -430,7 +430,7 @@ def _project_backward(
 
 @dataclass(frozen=True)
 class Projection:
-    """One map as several views see it; index v * padded + i is Gaussian i in view v."""
+    """One map projected into several views; index v * padded + i is Gaussian i in view v."""
 
     count: int  # Gaussians
     gaussians: Tensor  # [COLOR + C, G, LANES], or [COLOR + C, N] of kernels.rasterization_gpu
@@ -453,19 +453,19 @@ class Projection:
 
 
 def padded_to_lanes(name: str, table: Tensor) -> Tensor:  # [N, ...] -> [padded, ...]
-    """Return the table, ready for a kernel, with rows of zeros up to a multiple of LANES."""
+    """Return the table, ready for a kernel, padded with rows of zeros to a multiple of LANES."""
     missing = -len(table) % LANES
     table = plain(name, table)
     return torch.cat([table, table.new_zeros(missing, *table.shape[1:])]) if missing else table
 
 
 def by_lanes(table: Tensor) -> Tensor:  # [padded, ...] -> [K, LANES]
-    """Return the numbers of a table as kernels take it whose arguments are `lanes(1)`."""
+    """Return the numbers of a table in the shape of a `lanes(1)` argument."""
     return table.view(table.numel() // LANES, LANES)
 
 
 def by_sums(table: Tensor) -> Tensor:  # [N, K SUMS] -> [N, K, SUMS]
-    """Return a table as kernels take it whose arguments are `sums(2)`."""
+    """Return a table in the shape of a `sums(2)` argument."""
     return table.view(len(table), table.shape[1] // SUMS, SUMS)
 
 
@@ -481,9 +481,9 @@ def project(
     tile: int,
     low_pass: float,
 ) -> Projection:
-    """Project every Gaussian into every view, and find the tiles it touches there."""
+    """Project every Gaussian into every view, and find the tiles that it touches."""
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    tables = [padded_to_lanes(name, table) for name, table in named.items()]  # filled up with opacity 0
+    tables = [padded_to_lanes(name, table) for name, table in named.items()]  # padding has opacity 0
     channels, padded, device = colors.shape[1], len(tables[0]), means.device
     n = len(poses) * padded
 

@@ -4,12 +4,13 @@
     T_i = prod_{j<i} (1 - alpha_j),   alpha_i = o_i exp(-1/2 d_i^T K_i d_i)
 
 Every tile of pixels has its list of Gaussians, front to back (kernels.tile_lists). On a CPU one worker owns
-a tile: it copies the records of the list to where they stay in its cache, and lists them for each block of
-4 x 4 pixels that their ellipses reach. The pixels of a block are the lanes of a vector (kernels.lanes): their
-state stays in registers while the block's list is walked, and a pixel that an ellipse does not reach, or that
-is finished, is masked out. The backward pass walks the same lists in reverse; each (Gaussian, tile) pair has
-a private slot for its gradient, and the slots of a Gaussian are summed in a fixed order: no atomics, and the
-same bits at every run. On a GPU every pixel is a thread (kernels.rasterization_gpu).
+a tile: it copies the list's records into memory that stays in its cache, and lists them for each block of
+4 x 4 pixels that their ellipses reach. The pixels of a block are the lanes of a vector (kernels.lanes). Their
+state stays in registers while the worker traverses the block's list; pixels that an ellipse does not reach,
+or that are finished, are masked out. The backward pass traverses the same lists in reverse. Each (Gaussian,
+tile) pair has a private slot for its gradient, and the slots of a Gaussian are summed in a fixed order. So no
+atomics are needed, and every run gives the same bits. On a GPU every pixel is a thread
+(kernels.rasterization_gpu).
 
 Images are stored by blocks inside the kernels: [..., tiles * blocks, LANES].
 
@@ -149,7 +150,7 @@ def _rasterize_backward(
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where workers keep what they need of a tile."""
+    """Memory for the tiles that workers process."""
 
     near: Tensor  # [workers * longest, record_size]
     near_grad: Tensor  # [workers * longest, gradient_size]
@@ -158,7 +159,7 @@ class Workspace:
 
     @staticmethod
     def of(projection: Projection, lists: TileLists, num_views: int = 1) -> "Workspace":
-        """Return memory for as many tiles as are worked on at once, `num_views` a worker."""
+        """Return memory for the tiles processed at once, `num_views` per worker."""
         record, longest, blocks = projection.record, max(lists.longest, 1), (lists.tile // BLOCK) ** 2
         spaces = workers() * num_views
         return Workspace(
@@ -173,7 +174,7 @@ def to_blocks(
     images: Tensor,  # [K, H, W]
     tile: int,
 ) -> Tensor:  # [K, tiles * blocks, LANES]
-    """Return images by tiles and blocks, filled up with zeros."""
+    """Return images by tiles and blocks, padded with zeros."""
     num, height, width = images.shape
     rows, columns, across = -(-height // tile), -(-width // tile), tile // BLOCK
     if (rows * tile, columns * tile) != (height, width):
@@ -284,7 +285,7 @@ def rasterize(
     T_camera_world: Tensor,  # [4, 4]
     intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy; pixel centres at integers
     size: tuple[int, int],  # (width, height)
-    tile: int | None = None,  # pixels; None: what suits the path
+    tile: int | None = None,  # pixels; None: the default of the CPU or GPU path
     low_pass: float = LOW_PASS,  # px^2 added to every 2D covariance; less in a view of reduced size
     pixelwise: bool | None = None,  # a pixel per thread instead of blocks of them; None: on a GPU
 ) -> Rasterization:
@@ -317,7 +318,7 @@ def rasterize(
 
 
 def check_tile(tile: int, size: tuple[int, int]) -> None:
-    """Raise ValueError unless the image can be cut into tiles of that size."""
+    """Raise ValueError unless the image can be divided into tiles of this size."""
     smallest = BLOCK * max(-(-max(size) // (BLOCK * MAX_TILES)), 1)
     if tile < smallest or tile % BLOCK:
         raise ValueError(f"tile: expected a multiple of {BLOCK} of at least {smallest}, got {tile}")
@@ -326,7 +327,7 @@ def check_tile(tile: int, size: tuple[int, int]) -> None:
 
 
 def check_gaussians(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> None:
-    """Raise ValueError unless the shapes belong together."""
+    """Raise ValueError unless the shapes agree."""
     n = means.shape[0]
     for name, tensor, shape in (
         ("means", means, (None, 3)),

@@ -1,9 +1,9 @@
-"""Rendering with one Gaussian, and then one pixel, per thread: the way of a GPU.
+"""Rendering on a GPU: one thread per Gaussian for projection, then one per pixel for compositing.
 
-The functions are those of the CPU's path (kernels.projection, kernels.compositing), applied to numbers
-instead of lanes of vectors. A thread walks its tile's whole list, and adds to the slots of gradients
-atomically, so that sums may differ in their last bits from run to run. Sorting and prefix sums are torch's,
-on the device; the number of (Gaussian, tile) pairs is read back once a view, to allocate their lists.
+The functions are those of the CPU path (kernels.projection, kernels.compositing), applied to scalars instead
+of vectors. A thread traverses its tile's whole list, and adds to the slots of gradients atomically, so sums
+may differ in their last bits from run to run. torch sorts and computes prefix sums on the device. The number
+of (Gaussian, tile) pairs is read back once per view, to allocate their lists.
 """
 
 import torch
@@ -117,7 +117,7 @@ def _name_slots(
 
 @ti.func
 def position(i, tile, columns):
-    """Pixel x, y and tile of place i in images that are stored by blocks of tiles."""
+    """Pixel x, y and tile of index i in images that are stored by blocks of tiles."""
     across = tile // BLOCK
     t, block, lane = i // (tile * tile), i % (tile * tile) // LANES, i % LANES
     x = t % columns * tile + block % across * BLOCK + lane % BLOCK
@@ -209,7 +209,7 @@ def project(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, poses: Tensor,
     intrinsics: tuple[float, float, float, float], size: tuple[int, int], tile: int, low_pass: float,
 ) -> Projection:  # fmt: skip
-    """Do as `kernels.projection.project`, but for the blocks that a Gaussian touches."""
+    """Do the same as `kernels.projection.project`, except for the blocks that a Gaussian touches."""
     channels, count, device = colors.shape[1], len(means), means.device
     tables = {
         "means": means,
@@ -234,7 +234,7 @@ def project(
 
 
 def list_pairs(projection: Projection, size: tuple[int, int], tile: int) -> TileLists:
-    """Do as `kernels.tile_lists.list_pairs`."""
+    """Do the same as `kernels.tile_lists.list_pairs`."""
     columns, rows = (-(-pixels // tile) for pixels in size)
     num_pairs, device = int(projection.first_slot[-1]), projection.record.device
     keys = torch.empty(num_pairs, dtype=torch.int64, device=device)
@@ -254,7 +254,7 @@ def draw_lists(
     projection: Projection, lists: TileLists, size: tuple[int, int], values: Tensor, transmittance: Tensor,
     last: Tensor, front: Tensor, visible: Tensor,
 ) -> None:  # fmt: skip
-    """Fill the images, which are stored by blocks."""
+    """Composite all pixels; the images are stored by blocks."""
     _draw(
         projection.record, lists.start, lists.pairs, *size, lists.tile,
         values.view(len(values), -1), transmittance.view(-1), last.view(-1), front.view(-1), visible,
@@ -277,7 +277,7 @@ def draw_lists_backward(
 
 
 def project_backward(projection: Projection, slot_grad: Tensor) -> tuple[list[Tensor], Tensor]:
-    """Do as `kernels.projection.project_backward`."""
+    """Do the same as `kernels.projection.project_backward`."""
     gaussians, poses = projection.gaussians, projection.poses
     gradient = torch.empty_like(gaussians)
     parts = gaussians.new_zeros(len(poses), projection.count, 12)

@@ -1,8 +1,8 @@
-"""Twins of all kernels in plain torch, or in numpy where nothing is differentiated: the specification.
+"""Twins of the kernels in plain torch, or in numpy where no gradient is needed: the specification.
 
-They are written for reading, and tests compare the kernels with them. What is in torch is differentiable by
-autograd, which is the oracle for the hand-written backward passes. Kernels for a CPU and for a GPU have one
-twin, as they compute the same. The twins of kernels.texture are in kernels/reference_texture.py.
+They are written for reading, and tests compare the kernels with them. Autograd differentiates the twins in
+torch, and tests compare the hand-written backward passes with its gradients. Kernels for a CPU and for a GPU
+have one twin, because they compute the same. The twins of kernels.texture are in reference_texture.py.
 """
 
 from collections.abc import Sequence
@@ -220,7 +220,7 @@ def average_depth(
     intrinsics: tuple[float, float, float, float],
     agreement: DepthAgreement,
 ) -> np.ndarray:  # [H, W]
-    """Return each pixel's depth averaged with those, along its ray, that others measured and that agree."""
+    """Return each pixel's depth averaged along its ray with depths of other images that agree."""
     result = depth.astype(float)
     for v, u in np.argwhere(depth > 0):
         own = float(depth[v, u])
@@ -280,7 +280,7 @@ def brightness_image(
     huber_threshold: float,
     is_robust: Sequence[bool],  # solutions
 ) -> np.ndarray:  # [H, W]
-    """Return the image that conjugate gradients approach, by solving the normal equations directly."""
+    """Return the image to which conjugate gradients converge, by solving the normal equations directly."""
     level = prior.ravel()
     for robust in is_robust:
         size = np.abs(A @ level - b).clip(1e-12)

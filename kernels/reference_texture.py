@@ -1,4 +1,4 @@
-"""Numpy twins of kernels.texture: rays of a camera, shading of what they hit, and edges of surfaces."""
+"""Numpy twins of kernels.texture: rays of a camera, shading of their hits, and edges of surfaces."""
 
 import numpy as np
 
@@ -94,7 +94,7 @@ def look_up(textures: TextureTable, texture: int, level: int, repeat: bool, at: 
 
 
 def mark_edges(grey: np.ndarray, surface: np.ndarray, contrast: float) -> np.ndarray:  # [H, W] each
-    """Return 1 where one of the 8 neighbours shows another surface of visibly other brightness."""
+    """Return 1 where one of the 8 neighbours shows another surface of visibly different brightness."""
     height, width = grey.shape
     edges = np.zeros(grey.shape, np.uint8)
     for y, x in np.ndindex(height, width):

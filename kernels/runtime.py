@@ -1,4 +1,4 @@
-"""Start Taichi, and check what crosses the boundary between torch and Taichi."""
+"""Starts Taichi, and checks the arrays that pass between torch and Taichi."""
 
 import contextlib
 import io
@@ -16,9 +16,9 @@ CHUNK = 512  # Taichi's CPU backend never splits a loop into pieces smaller than
 def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: bool | None = None) -> None:
     """Start Taichi on "cpu" or "cuda"; "f64" makes the same kernels run in double precision.
 
-    `threads` is the number of CPU workers. `debug` checks array bounds (slow); None: as the environment
-    variable TI_DEBUG says. Calling it again restarts Taichi. Raises RuntimeError when the device is not
-    there: Taichi itself only warns.
+    `threads` is the number of CPU workers. `debug` checks array bounds (slow); None: the environment variable
+    TI_DEBUG decides. Calling it again restarts Taichi. Raises RuntimeError when the device is missing; Taichi
+    itself only warns.
     """
     if arch not in ("cpu", "cuda"):
         raise ValueError(f"arch: expected 'cpu' or 'cuda', got {arch!r}")
@@ -26,7 +26,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
         raise ValueError(f"precision: expected 'f32' or 'f64', got {precision!r}")
     if arch == "cuda" and not torch.cuda.is_available():
         raise RuntimeError("cuda: torch finds no CUDA device (or is a CPU build); use --device cpu")
-    with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its device without being asked
+    with contextlib.redirect_stdout(io.StringIO()):  # ti.init always prints its device
         _start(arch, precision, threads, debug)
     actual = ti.cfg.arch
     if (actual == ti.cuda) != (arch == "cuda"):
@@ -55,7 +55,7 @@ def is_gpu() -> bool:
 
 
 def synchronize() -> None:
-    """Wait until the GPU has done what kernels and torch have launched."""
+    """Wait until the GPU has finished all that kernels and torch have launched."""
     ti.sync()
     torch.cuda.synchronize()
 
@@ -81,7 +81,7 @@ def check_shape(name: str, array: "torch.Tensor | np.ndarray", expected: tuple[i
 def plain(name: str, tensor: torch.Tensor) -> torch.Tensor:
     """Return the tensor detached, contiguous and in the kernels' float type, ready for a kernel.
 
-    A tensor that requires grad would get a `.grad` allocated behind our back.
+    For a tensor that requires grad, Taichi would silently allocate a `.grad`.
     """
     if not tensor.is_floating_point():
         raise ValueError(f"{name}: expected a floating point tensor, got {tensor.dtype}")

@@ -1,13 +1,13 @@
-"""Rays of a pinhole camera and the brightness of what they hit, filtered to the size of a pixel.
+"""Rays of a pinhole camera and the brightness at their hits, filtered to the size of a pixel.
 
 A ray x(t) = o + t d with d = R ((u - cx)/fx, (v - cy)/fy, 1) hits a plane with normal n. Moving the
 pixel by du turns d by dd = R[:, 0] / fx, and the hit point moves by
 
     dx = t (dd - d (n . dd) / (n . d)),
 
-so with the gradient G [2, 3] of the texture coordinates along the triangle, a pixel covers the
-parallelogram (G dx_u, G dx_v) of texels. It is averaged by up to MAX_TAPS trilinear look-ups along its
-longer side, each in the mip level as coarse as its share (anisotropic filtering).
+so with the gradient G [2, 3] of the texture coordinates along the triangle, a pixel covers the parallelogram
+(G dx_u, G dx_v) of texels. Up to MAX_TAPS trilinear look-ups along its longer side average it, each in the
+mip level that matches its share (anisotropic filtering).
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class TextureTable:
 
 @dataclass(frozen=True)
 class TriangleTable:
-    """What shading needs of each triangle; texture coordinates in texels, texel i covers [i, i+1)."""
+    """Data of each triangle for shading; texture coordinates in texels, texel i covers [i, i+1)."""
 
     values: np.ndarray  # [T, 24] float32: uv of 3 corners, G [2, 3], normal, tint of 3 corners, light uv of 3
     indices: np.ndarray  # [T, 3] int32: texture (-1: none), light map (-1: none), surface
@@ -140,7 +140,7 @@ def _shade(
                 if length_v > length_u:
                     longer = side_v
                     major, minor = length_v, length_u
-                ratio = major / ti.max(minor, 1.0)  # shares of less than a texel need no more look-ups
+                ratio = major / ti.max(minor, 1.0)  # look-ups closer than a texel add nothing
                 taps = ti.cast(ti.math.clamp(ti.ceil(ratio - 0.25), 1.0, float(MAX_TAPS)), ti.i32)
                 coarse = ti.max(minor, major / ti.cast(taps, ti.f32))  # texels one look-up has to average
                 lod = ti.math.clamp(
@@ -272,7 +272,7 @@ def mark_edges(
     surface: np.ndarray,  # [H, W] int32
     contrast: float,  # smallest Michelson contrast that counts
 ) -> np.ndarray:  # [H, W] uint8
-    """Return 1 where one of the 8 neighbours shows another surface of visibly other brightness."""
+    """Return 1 where one of the 8 neighbours shows another surface of visibly different brightness."""
     check_shape("surface", surface, grey.shape)
     edges = np.empty(grey.shape, np.uint8)
     _mark_edges(grey, surface, contrast, edges)
@@ -284,7 +284,7 @@ def write_sample_means(
     pixels: np.ndarray,  # [M] int32
     grey: np.ndarray,  # [H * W] float32, changed
 ) -> None:
-    """Overwrite the listed pixels by the means of their samples."""
+    """Overwrite the listed pixels with the means of their samples."""
     check_shape("samples", samples, (len(pixels), None))
     if len(pixels):
         _average_samples(samples, pixels, grey)

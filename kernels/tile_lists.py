@@ -1,8 +1,7 @@
-"""Which Gaussians each tile of pixels draws, front to back.
+"""Lists the Gaussians that each tile of pixels draws, front to back.
 
-All drawn Gaussians are sorted by depth once, and then listed by tile in that order by a stable counting
-sort. Every (Gaussian, tile) pair has a slot of its own for its gradient, and the slots of a Gaussian
-are neighbours.
+All drawn Gaussians are sorted by depth once. A stable counting sort then lists them by tile in that order.
+Every (Gaussian, tile) pair has a slot of its own for its gradient; the slots of a Gaussian are contiguous.
 """
 
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ def _sort_by_depth(
     digits: ti.types.ndarray(ti.i32, ndim=2),  # scratch [3, RADIX]
     numbers: ti.types.ndarray(ti.i32, ndim=1),  # out [2]: [0] drawn Gaussians
 ):
-    # A stable radix sort in three passes; an unstable one would not be repeatable for equal depths.
+    # A stable radix sort in three passes; an unstable sort would not be reproducible for equal depths.
     ti.loop_config(serialize=True)
     for _ in range(1):
         for digit in range(RADIX):
@@ -126,7 +125,7 @@ class TileLists:
     longest: int  # list
 
     def new_slots(self, projection: Projection) -> Tensor:  # [P, gradient_size(C)]
-        """Return memory for one gradient a pair."""
+        """Return memory for one gradient per pair."""
         return projection.record.new_empty(len(self.pairs), gradient_size(projection.channels))
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.runtime import CHUNK, check_shape, workers
 
-MANY_EVENTS = 500_000  # below this numpy is done before a second core has woken up
-ROUNDS = 4  # at most, newest events first, until every pixel has had one
-ROUND = 8  # events a pixel, after which that may be
-PACKED = 4  # int16 to a 64-bit word
-EVEN = 0x0000FFFF0000FFFF  # bits of the first and the third
+MANY_EVENTS = 500_000  # with fewer, numpy finishes before a second core has woken up
+ROUNDS = 4  # at most this many, from the newest events backwards, until every pixel has had one
+ROUND = 8  # at least this many events per pixel in one of several rounds
+PACKED = 4  # int16 in a 64-bit word
+EVEN = 0x0000FFFF0000FFFF  # bits of the first and third int16
 
 
 @ti.kernel
@@ -30,8 +30,8 @@ def _newest_events(
     newest: ti.types.ndarray(ti.i32, ndim=1),  # out [workers * pixels] index of an event, -1 in
     by_polarity: ti.template(),
 ):
-    # Parallel stores to one image race and atomics are slow: each worker has a part of the time and an
-    # image of its own, of indices, because those are half as long as times and need not be read.
+    # Parallel stores to one image would race, and atomics are slow. So each worker has a part of the time and
+    # an image of its own. It holds indices, which are half as long as times and need not be read.
     num_pixels, words = newest.shape[0] // num_workers, ti.cast(last - first, ti.i64)
     for chunk in range(num_workers * CHUNK):
         if chunk % CHUNK == 0:
@@ -39,7 +39,7 @@ def _newest_events(
             own = w * num_pixels
             begin, end = words * w // num_workers, words * (w + 1) // num_workers
             for word in range(first + ti.cast(begin, ti.i32), first + ti.cast(end, ti.i32)):
-                # Two pixels, y * width + x, in one product: either half of a number is one of them.
+                # Two pixels, y * width + x, in one product: each half of the number is one of them.
                 even = (y[word] & ti.i64(EVEN)) * width + (x[word] & ti.i64(EVEN))
                 odd = (y[word] >> 16 & ti.i64(EVEN)) * width + (x[word] >> 16 & ti.i64(EVEN))
                 pixels = [even, odd, even >> 32, odd >> 32]
@@ -63,7 +63,7 @@ def _count_events(
     ti.loop_config(serialize=True)  # the last event wins
     for i in range(x.shape[0]):
         pixel = ti.cast(y[i], ti.i32) * width + ti.cast(x[i], ti.i32)
-        # As a condition, the polarity would often be predicted wrong.
+        # A branch on the polarity would often be mispredicted.
         is_positive = ti.cast(polarity[i], ti.i32) + 1 >> 1
         counts[2 * pixel + is_positive] = counts[2 * pixel + is_positive] + 1
         last[pixel] = polarity[i]
@@ -137,7 +137,7 @@ def _newest(
 
 @functools.lru_cache(maxsize=1)
 def _memory(num_workers: int, num_pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return memory that is kept: the pages of a fresh array cost more than to fill it."""
+    """Return memory that is kept, because allocating a fresh array's pages costs more than filling it."""
     return np.empty((num_workers, num_pixels), np.int32), np.empty(num_pixels, np.int32)
 
 
@@ -160,7 +160,7 @@ def count_events(
     counts: np.ndarray,  # [H, W, 2] int32, changed in place: negative and positive events
     last: np.ndarray,  # [H, W] int8, changed in place: polarity of the newest event
 ) -> None:
-    """Add events to each pixel's numbers of either polarity (Eq. 11), and note its newest one."""
+    """Add events to each pixel's counts of both polarities (Eq. 11), and record its newest polarity."""
     check_shape("y", y, x.shape)
     check_shape("polarity", polarity, x.shape)
     check_shape("counts", counts, (*last.shape, 2))
@@ -170,15 +170,15 @@ def count_events(
 
 
 def compile_kernels() -> None:
-    """Compile what a running sum needs, so that the first frame of a sequence need not wait for it."""
+    """Compile the counting kernel, so that the first frame of a sequence does not wait for it."""
     place, one = np.zeros(1, np.int16), np.ones(1, np.int8)
     count_events(place, place, one, np.zeros((1, 1, 2), np.int32), np.zeros((1, 1), np.int8))
 
 
 def _check_inside(x: np.ndarray, y: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Kernels do not check bounds, so this does."""
+    """Check that all events are inside the image, because kernels do not check bounds."""
     height, width = shape
-    # As unsigned numbers negative ones are large: one comparison for both bounds.
+    # Negative numbers are large as unsigned ones, so one comparison checks both bounds.
     if x.view(np.uint16).max() >= width or y.view(np.uint16).max() >= height:
         raise ValueError(
             f"events: expected 0 <= x < {width} and 0 <= y < {height}, got x {x.min()} to {x.max()}, "

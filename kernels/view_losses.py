@@ -1,14 +1,14 @@
-"""A map compared with what events and depth say, and all gradients of that in one pass.
+"""Losses of a map's views against measurements of events and depth, with all gradients in one pass.
 
-Each block of pixels is composited, compared and differentiated while its list is still in the cache: no
-images are written, alpha is computed once, and the backward pass neither divides nor takes an exp. One
+Each block of pixels is composited, compared and differentiated while its list is still in the cache. No
+images are written, alpha is computed once, and the backward pass needs no division and no exp. One
 projection, one sort and one launch serve all views.
 
     two views, Eq. 10-12:  L = s sum (log((I_end + eps) / (I_start + eps)) - measured)^2
     one view:              L = s_e sum (log(I + eps) - target)^2 + s_d sum_{measured > 0} |D - A measured|
 
 with I = sum_i c_i alpha_i T_i + T_end background, D = sum_i d_i alpha_i T_i, A = 1 - T_end (Eq. 8), so that
-D - A measured = sum_i (d_i - measured) alpha_i T_i: what is transparent is no error of depth.
+D - A measured = sum_i (d_i - measured) alpha_i T_i: transparency is no depth error.
 """
 
 from dataclasses import dataclass
@@ -51,14 +51,14 @@ from edslam_ti.kernels.rasterization import (
 from edslam_ti.kernels.runtime import CHUNK, check_shape, is_gpu, plain
 from edslam_ti.kernels.tile_lists import list_pairs
 
-ALPHA, WEIGHT = 0, 1  # what is kept of every record that a block draws
+ALPHA, WEIGHT = 0, 1  # the two numbers kept for every record that a block draws
 
 
 @ti.func
 def composite(
     record: ti.template(), items: ti.template(), space, block, number, x, y, is_inside, kept: ti.template()
 ):
-    """T_end, intensity and depth of a block; keeps alpha and weight of what it draws."""
+    """T_end, intensity and depth of a block; keeps alpha and weight of each record that it draws."""
     T = ti.select(is_inside, 1.0, 0.0)
     intensity, depth = T * 0.0, T * 0.0
     for n in range(number):
@@ -90,7 +90,7 @@ def differentiate_block(
         q = record[at, FEATURES + 1] * grad_intensity - behind
         q += (record[at, FEATURES] - target_depth) * grad_depth
         behind += alpha * q
-        v = ti.select(alpha < MAX_ALPHA, weight * q, 0.0)  # min() passes no gradient where it cuts
+        v = ti.select(alpha < MAX_ALPHA, weight * q, 0.0)  # min() has no gradient where it clips
         dx, dy = x - record[at, MEAN_X], y - record[at, MEAN_Y]
         v_x, v_y = v * dx, v * dy
         total = sums_of(
@@ -184,7 +184,7 @@ def _compare_views(
 
 @dataclass(frozen=True)
 class Comparison:
-    """What views of a map differ by, from what was measured; only `loss` is differentiable."""
+    """Differences of a map's views from the measurements; only `loss` is differentiable."""
 
     loss: Tensor  # scalar
     difference: Tensor  # [H, W] log brightness, or its change, minus the target
@@ -277,7 +277,7 @@ def compare_view(
     tile: int = TILE,
     pixelwise: bool | None = None,  # render a pixel per thread and compare in torch; None: on a GPU
 ) -> Comparison:
-    """Return how much a view differs from a target, in brightness squared and in depth."""
+    """Return the loss of a view against a target: squared brightness error and absolute depth error."""
     check_shape("T_camera_world", T_camera_world, (4, 4))
     return _compare(
         means, quats, scales, opacities, colors, T_camera_world[None], intrinsics, size,

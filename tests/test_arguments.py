@@ -99,7 +99,7 @@ def test_former_names_are_read_from_files_too() -> None:
     assert Everything.validated(merged(base, differences), "test").inner.speed == 4.0
 
 
-def test_help_shows_defaults_and_what_is_required(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_defaults_and_required_options(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         read("--help")
     assert stop.value.code == 0

@@ -159,7 +159,7 @@ def test_built_in_room_stands_in_and_says_so(
         ("--scene none --dataset event_replica", "sequences there: my_room, office0"),
     ],
 )
-def test_unknown_scenes_list_what_there_is(
+def test_unknown_scenes_list_the_existing_ones(
     data: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str
 ) -> None:
     (data / "my_room" / "calib.txt").write_text("30 30 16 12 0 0 0 0 0\n")
@@ -168,7 +168,7 @@ def test_unknown_scenes_list_what_there_is(
     assert message in got[1]
 
 
-def test_a_sequence_given_as_the_data_folder_is_recognised(
+def test_a_sequence_given_as_the_data_folder_is_detected(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, message = failure(capsys, lambda: open_asked("--data-dir", str(data / "my_room"), "--scene", "x"))

@@ -28,7 +28,7 @@ def test_steps_are_found_on_both_sides_and_not_on_a_slanted_plane() -> None:
     assert (beside_steps(step) == expected).all()
 
 
-def test_large_holes_lie_behind_what_surrounds_them_and_narrow_ones_stay() -> None:
+def test_large_holes_are_filled_behind_their_surroundings_and_narrow_ones_stay() -> None:
     depth = np.full((60, 80), 2.0, np.float32)
     depth[:, 40:] = 3.0
     depth[10:40, 30:60] = 0  # a window
@@ -81,7 +81,7 @@ def test_images_are_halved_to_the_means_of_blocks() -> None:
     assert downscaled(image).dtype == np.float32
 
 
-def test_a_surface_goes_on_through_a_slant_but_not_over_a_step_or_a_hole() -> None:
+def test_slants_are_smooth_but_steps_and_holes_are_not() -> None:
     before, depth, after = np.array([[1.9, 2.0, 0.0, 2.0], [2.0] * 4, [2.1, 2.1, 2.0, 2.01]])
     assert is_smooth(before, depth, after).tolist() == [True, False, False, True]
 

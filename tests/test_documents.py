@@ -395,7 +395,7 @@ def test_recipe_for_a_viewer(tmp_path: Path, tiny_folder: Path, capsys: pytest.C
 # --- tables ---
 
 
-def test_tables_are_what_the_stored_numbers_say() -> None:
+def test_tables_agree_with_the_stored_numbers() -> None:
     report_tables(ROOT, check=True)
 
 

@@ -32,7 +32,7 @@ def test_surface_remembers_events_of_earlier_frames_until_it_is_reset() -> None:
     assert not builder.build(frame(0.2, Events.empty())).level(0).surface.any()
 
 
-def test_chunk_begins_where_the_last_one_ended() -> None:
+def test_chunk_starts_where_the_previous_one_ended() -> None:
     builder = FrameBuilder(CAMERA)
     first = builder.build(Sample(0.05, Events.empty(), depth=None))
     second = builder.build(Sample(0.15, Events.empty(), depth=None), is_held_out=True)

@@ -159,7 +159,7 @@ def test_metrics_have_every_key_and_are_right(result: Path) -> None:
     assert not metrics["is_interrupted"]
 
 
-def test_poses_as_tracked_are_kept_beside_the_corrected_ones(result: Path) -> None:
+def test_tracked_poses_are_saved_in_addition_to_the_corrected_ones(result: Path) -> None:
     final, tracked = (read_tum(result / f"trajectory{name}_tum.txt") for name in ("", "_frontend"))
     np.testing.assert_allclose(tracked.timestamps, final.timestamps)
     moved = np.abs(tracked.poses[:, :3, 3] - final.poses[:, :3, 3]).max()  # by bundle adjustment
@@ -200,7 +200,7 @@ def test_renders_are_of_held_out_and_novel_views(result: Path) -> None:
     assert sheet.shape[0] > 7 * 160  # 3 + 4 views, enlarged twofold
 
 
-def test_views_used_for_mapping_held_out_and_beside_the_path_are_reported_apart(result: Path) -> None:
+def test_mapped_held_out_and_novel_views_are_reported_separately(result: Path) -> None:
     metrics = metrics_of(result)
     for suffix, kind, count in (("", "held_out", 3), ("_mapped", "mapped", 3), ("_novel", "novel", 4)):
         assert metrics[f"num_{kind}_views"] == count
@@ -277,7 +277,7 @@ def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
         assert (again / name).read_bytes() == (result / name).read_bytes(), name
 
 
-def test_log_says_what_was_run(result: Path) -> None:
+def test_log_describes_the_run(result: Path) -> None:
     lines = (result / "log.txt").read_text().splitlines()
     assert "tiny: tiny test room, method ed_slam" in lines[0]
     assert any("first brightness image" in line for line in lines)
@@ -429,7 +429,7 @@ def interrupt_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_interrupt_saves_what_there_is_and_exits_130(
+def test_interrupt_saves_partial_results_and_exits_130(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = signal.getsignal(signal.SIGINT)

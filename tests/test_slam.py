@@ -57,7 +57,7 @@ def test_lost_frames_are_counted_and_do_not_end_the_run() -> None:
     assert slam.tracking_seconds > 0
 
 
-def test_corrections_of_a_tracker_reach_the_trajectory_but_not_what_was_tracked() -> None:
+def test_tracker_corrections_change_the_trajectory_but_not_the_frontend_one() -> None:
     class Hindsight(Follower):
         def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
             result = super().track(frame, guess, trajectory)

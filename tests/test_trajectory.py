@@ -92,7 +92,7 @@ def test_tum_file_reads_back_the_path(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.poses, path.poses, atol=2e-9)  # nine decimals
 
 
-def test_tum_file_is_what_evo_reads(tmp_path: Path) -> None:
+def test_evo_reads_the_tum_file(tmp_path: Path) -> None:
     from evo.tools.file_interface import read_tum_trajectory_file
 
     path = constant_velocity(np.linspace(0, 5, 20))
@@ -124,7 +124,7 @@ def test_rows_are_sorted_repeated_times_left_out_and_both_are_said(tmp_path: Pat
     ]
 
 
-def test_what_is_mended_goes_to_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_repairs_go_to_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = constant_velocity(np.linspace(0, 5, 20))
     write_tum(path, tmp_path / "t.txt")
     lines = (tmp_path / "t.txt").read_text().splitlines()
@@ -150,7 +150,7 @@ def test_two_recordings_in_one_file_are_refused(tmp_path: Path, delay: float, me
         read_tum(tmp_path / "t.txt")
 
 
-def test_stamps_since_the_epoch_come_back_to_the_microsecond(tmp_path: Path) -> None:
+def test_stamps_since_the_epoch_survive_to_the_microsecond(tmp_path: Path) -> None:
     from evo.tools.file_interface import read_tum_trajectory_file
 
     offset = 1642650000.0
@@ -222,7 +222,7 @@ def test_absent_and_binary_tum_files_are_refused(tmp_path: Path) -> None:
         read_tum(tmp_path / "binary.txt")
 
 
-def test_spread_poses_are_apart_in_place_or_direction() -> None:
+def test_spread_poses_differ_in_position_or_direction() -> None:
     poses = np.tile(np.eye(4), (31, 1, 1))
     poses[:11, 0, 3] = 0.03 * np.arange(11)  # 30 cm along x,
     poses[11:, 0, 3] = 0.3

@@ -157,7 +157,7 @@ def test_real_motion_has_no_impossible_pose(shared_data: Path) -> None:
         assert not impossible_poses(read_tum(file)).any(), file.name
 
 
-def test_paths_of_few_poses_are_taken_as_they_are() -> None:
+def test_all_poses_of_a_short_path_are_known() -> None:
     path = hand_held(20.0)
     assert not true_poses_at(Trajectory(), np.array([0.0]))[1].any()
     for count in (1, 2, 3):

@@ -1,1 +1,1 @@
-"""Trackers and mappers from other people's libraries, for comparison."""
+"""Trackers and mappers from other libraries, for comparison."""

@@ -1,7 +1,7 @@
-"""KISS-ICP on the points of the depth images, where the package `kiss-icp` is installed.
+"""KISS-ICP on the points of the depth images, if the package `kiss-icp` is installed.
 
-Vizzo et al. 2023, the authors' own code (the extra `kiss`). It is made for lidars; the settings here
-are scaled to rooms. It sees depth images only, so the poses of frames without depth are predicted.
+Vizzo et al. 2023, the authors' own code (the extra `kiss`). It is designed for lidars; the settings here are
+scaled to rooms. It uses depth images only, so the poses of frames without depth are predicted.
 """
 
 from typing import Any
@@ -16,8 +16,8 @@ from edslam_ti.trajectory import Trajectory
 
 MAX_RANGE, MIN_RANGE = 10.0, 0.1  # metres
 VOXEL_SIZE = 0.03  # metres, of its local map
-INITIAL_THRESHOLD = 0.1  # metres within which partners are sought at first
-MIN_MOTION = 0.002  # metres from which motion counts for the adaptive threshold
+INITIAL_THRESHOLD = 0.1  # metres; initial distance within which points are matched
+MIN_MOTION = 0.002  # metres; smaller motions do not change the adaptive threshold
 
 
 class KissIcpTracker:
@@ -40,7 +40,7 @@ class KissIcpTracker:
         self._T_world_start: np.ndarray | None = None
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; without depth it is the guess, and said to be lost."""
+        """Return the pose of `frame`; without depth, the guess, marked as lost."""
         if frame.depth is None:
             message = "no depth image at this time: pose predicted"
             return TrackingResult(T_world_camera_guess, False, 0.0, message)
@@ -52,4 +52,4 @@ class KissIcpTracker:
         return TrackingResult(self._T_world_start @ np.asarray(self._odometry.last_pose), True, 1.0)
 
     def consistency(self, trajectory: Trajectory) -> None:
-        """Return nothing: it does not compare its data."""
+        """Return None: it does not compare its data."""

@@ -1,7 +1,7 @@
 """Open3D's RGB-D odometry (a tracker) and its TSDF volume (a mapper).
 
-The methods are composed of library functions; they are no author's system. `open3d_rgbd` aligns each frame
-to a reference frame by brightness and depth (Park et al. 2017) and fuses it into a volume (Curless and Levoy
+The methods combine library functions; they are not a published system. `open3d_rgbd` aligns each frame to a
+reference frame by brightness and depth (Park et al. 2017) and fuses it into a volume (Curless and Levoy
 1996). It uses no events and needs images, which an event camera may not have. `open3d_icp` aligns depth
 alone: point-to-plane alignment with projective association (Newcombe et al. 2011). Open3D sums in parallel,
 so two runs agree to about a micrometre, not bit for bit.
@@ -29,7 +29,7 @@ VOXEL_SIZE = 0.02  # metres
 ITERATIONS = (10, 5, 3)  # coarse to fine, Open3D's default
 MIN_FITNESS = 0.3  # fraction of matched pixels below which tracking has failed
 # The reference is kept until the camera has moved this far. Open3D matches whole pixels, which hides smaller
-# motions: aligned from frame to frame, the drift is several times larger.
+# motions: with alignment from frame to frame the drift is several times larger.
 REFERENCE_DISTANCE = 0.1  # metres
 REFERENCE_ANGLE = 6.0  # degrees
 
@@ -44,7 +44,7 @@ class OdometryTracker:
         self._reference: tuple[Any, np.ndarray] | None = None  # RGB-D image, T_world_camera
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`; where its depth or image is missing, the guess, marked as lost."""
+        """Return the pose of `frame`; without depth or image, the guess, marked as lost."""
         needs_image = self._method != "PointToPlane"
         if frame.depth is None or (needs_image and frame.image is None):
             missing = "depth image" if frame.depth is None else "image"
@@ -72,7 +72,7 @@ class OdometryTracker:
         return TrackingResult(pose, converged, fitness, message)
 
     def consistency(self, trajectory: Trajectory) -> None:
-        """Return nothing: it does not compare its data."""
+        """Return None: it does not compare its data."""
 
     def _align(self, current: Any, reference: Any, T_guess: np.ndarray) -> tuple[np.ndarray, float]:
         """Return T_reference_camera and the fraction of pixels that support it."""
@@ -98,7 +98,7 @@ class RgbdOdometryTracker(OdometryTracker):
     """Aligns brightness and depth together."""
 
     def __init__(self, sequence: EventDepthSequence) -> None:
-        """Check that the sequence has images where it has depth."""
+        """Check that the sequence has images at the times of depth."""
         depth_times, image_times = sequence.depth_timestamps, sequence.image_timestamps
         gaps = np.abs(depth_times[:, None] - image_times[None]).min(1, initial=np.inf)  # [D] seconds
         if np.count_nonzero(gaps <= 1e-3) < 2:
@@ -118,7 +118,7 @@ class TsdfMapper:
 
     def __init__(self, camera: Camera) -> None:
         self._volume = TsdfVolume(camera, VOXEL_SIZE, MAX_DEPTH)
-        self._view: MeshView | None = None  # of the volume as it is now
+        self._view: MeshView | None = None  # of the present volume
 
     def update(self, frame: Frame, trajectory: Trajectory) -> None:
         """Fuse the newest frame, unless it is held out or lacks depth or image."""
@@ -128,7 +128,7 @@ class TsdfMapper:
         self._view = None
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
-        """Nothing is left to refine."""
+        """Do nothing: there is nothing to refine."""
         progress(1.0)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray, measured_only: bool = False) -> View:
@@ -149,11 +149,11 @@ class TsdfMapper:
         return self._volume
 
     def keyframe_indices(self) -> list[int]:
-        """Return nothing: every frame is fused, and none is chosen."""
+        """Return an empty list: every frame is fused, none is chosen as a keyframe."""
         return []
 
     def metrics(self) -> dict[str, int | float | None]:
-        """Return nothing: the volume has no numbers of its own."""
+        """Return no metrics: the volume has none of its own."""
         return {}
 
     def save(self, folder: Path) -> None:

@@ -14,7 +14,7 @@ COMMANDS = {
     "evaluate": "compare two trajectories, and a mesh with the true surfaces",
     "simulate": "write a simulated recording",
     "reproduce": "measure over many recordings: tracking, ablations, long_stream, report",
-    "benchmark": "time the kernels beside alternatives",
+    "benchmark": "time the kernels against alternatives",
 }
 
 

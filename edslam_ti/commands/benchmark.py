@@ -1,8 +1,8 @@
 """edslam benchmark --suites rasterizer tracking
 
-Time the kernels, and steps of a run, beside alternatives (torch, numpy, and numba and dv-processing where
+Time the kernels, and steps of a run, against alternatives (torch, numpy, and numba and dv-processing if
 installed) in turn in one process, and print a Markdown table; "limit" is the least time this machine could
-take. What takes more than two seconds a call is timed once. --out FOLDER also writes benchmark.md and
+take. Calls of more than two seconds are timed once. --out FOLDER also writes benchmark.md and
 benchmark.json there, and scaling.png for the suite `scaling`.
 
     edslam benchmark --engines taichi quadrants           both engines of the kernels, a column each

@@ -3,9 +3,9 @@
 To add a data set:
 
 1. Write `datasets/<name>.py` with a subclass of `EventDepthSequence` (base.py). Its constructor takes the
-   folder of one scene, sets every attribute of the base class and checks what it can see of the files.
-   files.py reads tables, images and depth; event_file.py reads events slice by slice.
-2. Add a line to `FORMATS`: how a folder is opened, how it is recognised, one line about the layout.
+   folder of one scene, sets every attribute of the base class, and checks the files as far as it can without
+   reading everything. files.py reads tables and images, depth.py depth, event_file.py events slice by slice.
+2. Add a line to `FORMATS`: how to open a folder, how to detect it, one line about the layout.
    `--dataset <name>`, automatic detection and the lists in error messages follow from that line.
 3. Write `configs/<name>.yaml` if the sensor needs settings that differ from the defaults.
 4. Test the loader on small files that the test writes in the published layout, as tests/datasets do.
@@ -39,13 +39,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Format:
-    """A layout of files that sequences come in."""
+    """A layout of a sequence's files."""
 
-    description: str  # what tells a folder of it, for messages
+    description: str  # the layout and its distinctive files, for messages
     open: Callable[[Path, Config], EventDepthSequence]  # from the folder of one scene
     detect: Callable[[Path], bool]  # whether a folder holds such a sequence
-    scenes: Callable[[], Sequence[str]] = tuple  # scenes that need no data, which `make` makes
-    make: Callable[[str], Path] | None = None  # their folder by the scene's name, made on first use
+    scenes: Callable[[], Sequence[str]] = tuple  # scenes that need no data; `make` makes them
+    make: Callable[[str], Path] | None = None  # returns a scene's folder, made on first use
 
 
 class Found(NamedTuple):
@@ -73,8 +73,8 @@ def _make_builtin(scene: str) -> Path:
     return builtin_sequence_folder(scene)
 
 
-# What --dataset chooses from. Without it, a recording in the first of them comes before all others, and any
-# recording before a built-in room.
+# The choices of --dataset. Without it, a recording in the first format takes precedence over all others, and
+# any recording over a built-in room.
 FORMATS: dict[str, Format] = {
     "event_replica": Format(
         "EventReplica's layout, with event_threshold_<C>/gray_events_data.npy",
@@ -146,7 +146,7 @@ def _find_in(config: Config, dataset: str) -> Found:
         return Found(dataset, None)
     if built_in:
         raise ConfigError(f"no built-in room '{config.scene}'; there are {', '.join(built_in)}")
-    # Any folder of that name: its loader says best what is missing in it.
+    # Any folder of that name: the loader's message says what is missing in it.
     for folder in _folders(config):
         return Found(dataset, folder)
     raise _not_found(config, {dataset: format})
@@ -164,7 +164,7 @@ def _folders(config: Config) -> Iterator[Path]:
 
 
 def _not_found(config: Config, formats: dict[str, Format]) -> ConfigError:
-    """Say what there is instead, of the formats that were looked for."""
+    """Return an error that lists the sequences that exist in these formats."""
     wanted = f"scene '{config.scene}' not found in {config.data_dir}"
     if not config.data_dir.is_dir():
         wanted += " (there is no such folder)"

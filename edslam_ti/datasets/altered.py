@@ -1,4 +1,4 @@
-"""A recording as a worse sensor would have made it: noisy or sparser depth, stretches without data."""
+"""A recording as a worse sensor would have made it: noisy or sparser depth, gaps in the data."""
 
 from dataclasses import replace
 
@@ -10,15 +10,15 @@ from edslam_ti.events import Events
 from edslam_ti.simulation.depth_noise import kinect_depth, viewing_cosine
 from edslam_ti.trajectory import Trajectory
 
-Gap = tuple[float, float]  # seconds from the sequence's clock, start and length
+Gap = tuple[float, float]  # start on the sequence's clock and length, seconds
 SAME_POSE = 1e-3  # metres, entries of rotation matrices
 
 
 class AlteredSequence(WrappedSequence):
-    """A sequence with exact depth, altered while it is read; the recording on disk stays as it is.
+    """A sequence with exact depth, altered while it is read; the recording on disk stays unchanged.
 
-    `noise` "kinect" adds a structured-light camera's noise, the same for one `seed`. `depth_rate` (Hz)
-    leaves out depth images, `event_gap` and `depth_gap` all data of a stretch.
+    `noise` "kinect" adds a structured-light camera's noise, reproducible for one `seed`. `depth_rate` (Hz)
+    leaves out depth images; `event_gap` and `depth_gap` leave out all data of an interval.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class AlteredSequence(WrappedSequence):
 
 
 class RepeatedSequence(WrappedSequence):
-    """A recording that ends where it began, played several times on end: as long a stream as is wanted."""
+    """A recording that ends where it began, played several times in a row to make a longer stream."""
 
     def __init__(self, sequence: EventDepthSequence, rounds: int) -> None:
         truth = sequence.truth
@@ -80,7 +80,7 @@ class RepeatedSequence(WrappedSequence):
         super().__init__(sequence)
         self._start = float(truth.timestamps[0])
         self._period = float(truth.timestamps[-1] - truth.timestamps[0])
-        self.description = f"{sequence.description}, {rounds} times on end"
+        self.description = f"{sequence.description}, {rounds} times in a row"
         self._rounds = rounds
         self.depth_timestamps, self._depth = self._repeated(sequence.depth_timestamps)
         self.image_timestamps, self._image = self._repeated(sequence.image_timestamps)
@@ -116,15 +116,15 @@ class RepeatedSequence(WrappedSequence):
         ]
 
     def _repeated(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [N] s -> [M] s, [M] indices
-        """Return the stamps of all rounds, and which of the recording's each is."""
+        """Return the stamps of all rounds, and the index of each in the recording."""
         times = np.concatenate([stamps + k * self._period for k in range(self._rounds)])
         indices = np.tile(np.arange(len(stamps)), self._rounds)
-        is_new = np.diff(times, prepend=-np.inf) > 1e-6  # a round begins with the last one's end
+        is_new = np.diff(times, prepend=-np.inf) > 1e-6  # a round starts at the end of the previous one
         return times[is_new], indices[is_new]
 
 
 def _thinned(stamps: np.ndarray, rate: float | None) -> np.ndarray:  # [D] s -> indices
-    """Return the stamps kept at a rate: the first, then each that is a period (to 2 %) after the last."""
+    """Return the stamps kept at a rate: each is at least a period (to 2 %) after the one kept before."""
     kept: list[int] = []
     for k, t in enumerate(stamps):
         if rate is None or not kept or t - stamps[kept[-1]] >= 0.98 / rate:

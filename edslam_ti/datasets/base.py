@@ -1,4 +1,4 @@
-"""What every sequence offers, and how it is cut into samples."""
+"""The interface of sequences, and their division into samples."""
 
 import inspect
 import itertools
@@ -33,23 +33,23 @@ class Sample:
 
 @dataclass(frozen=True)
 class NovelView:
-    """A true view from beside the path; for evaluation only."""
+    """A true view from a pose near the path, not on it; for evaluation only."""
 
-    timestamp: float  # seconds; the path's pose that it lies beside
+    timestamp: float  # seconds, of the path's pose nearby
     image: np.ndarray  # [H, W] float32 in [0, 1]
     depth: np.ndarray  # [H, W] float32 metres, exact, 0 = missing
     T_world_camera: np.ndarray  # [4, 4]
 
 
 class EventDepthSequence(ABC):
-    """Streams of events and depth, with images and true poses where the data has them.
+    """Streams of events and depth, with images and true poses if the data has them.
 
-    Data of depth cameras alone has no events: `has_events` is False, `events` returns empty slices and
+    Recordings of depth cameras alone have no events: `has_events` is False, `events` returns empty slices and
     `time_range` is that of the depth images.
 
-    Constructors validate what they can see without reading everything, and raise `DataError` or
-    `FileNotFoundError`; reading methods raise `DataError` on what only then shows. One image that cannot be
-    used is no reason to lose a run: `depth_or_none` and `image_or_none` leave it out and add to `notes`.
+    Constructors validate what they can without reading everything, and raise `DataError` or
+    `FileNotFoundError`. Reading methods raise `DataError` for faults that show only then. One unusable image
+    must not end a run: `depth_or_none` and `image_or_none` leave it out and add to `notes`.
     """
 
     dataset: str
@@ -60,20 +60,20 @@ class EventDepthSequence(ABC):
     depth_timestamps: np.ndarray  # [D] seconds, strictly increasing
     image_timestamps: np.ndarray  # [I] seconds, strictly increasing; may be empty
     exposure: float | None = None  # seconds over which an image integrates, when the data states it
-    description: str  # one line: what this is; a stand-in says so
+    description: str  # one line about the recording; a stand-in must say that it is one
     surfaces_file: Path | None = None  # true surfaces of a simulated scene, a PLY mesh; for evaluation only
     has_events: bool = True
-    num_dropped_events: int = 0  # rows of the events' file that were bad and left out
+    num_dropped_events: int = 0  # bad rows of the event file, which were left out
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
-    depth_varies: bool = False  # depth images usually show more than one value: one that does not is broken
+    depth_varies: bool = False  # depth images usually show several values: one with a single value is broken
 
     @cached_property
     def notes(self) -> list[str]:
-        """What was left out or mended while reading, a line each, for the log; wrappers share the list."""
+        """A line for each omission or repair while reading, for the log; wrappers share the list."""
         return []
 
     def note(self, text: str) -> None:
-        """Add a line to `notes` that is not there yet."""
+        """Add a line to `notes` unless it is there already."""
         text = plain(text, LONGEST_MESSAGE)
         if text not in self.notes:
             self.notes.append(text)
@@ -118,11 +118,11 @@ class EventDepthSequence(ABC):
         """Times of the first and the last event in seconds; of depth images where there are no events."""
 
     def novel_views(self) -> list[NovelView]:
-        """Return the true views beside the path, in the order of time; data without any has none."""
+        """Return the novel views in the order of time; empty if the data has none."""
         return []
 
     def image_at(self, timestamp: float, tolerance: float = 1e-3) -> np.ndarray | None:
-        """Return the image taken within `tolerance` seconds of a time, if there is one to be read."""
+        """Return the image taken within `tolerance` seconds of a time; None: missing or unreadable."""
         if len(self.image_timestamps) == 0:
             return None
         k = int(np.abs(self.image_timestamps - timestamp).argmin())
@@ -140,7 +140,7 @@ def stamp_text(sequence: EventDepthSequence, time: float) -> str:
 
 def has_variation(depth: np.ndarray) -> bool:  # [H, W] m
     """Return whether a depth image shows at least two depths."""
-    for part in (depth[::8, ::8], depth):  # a few pixels tell it nearly always
+    for part in (depth[::8, ::8], depth):  # a few pixels suffice nearly always
         measured = part[part > 0]
         if measured.size and measured.min() < measured.max():
             return True
@@ -148,11 +148,10 @@ def has_variation(depth: np.ndarray) -> bool:  # [H, W] m
 
 
 class WrappedSequence(EventDepthSequence):
-    """A sequence that shows another one; subclasses override what they change.
+    """A sequence that wraps another one; subclasses override what they change.
 
-    Every attribute of `EventDepthSequence` is taken over when the wrapper is made, so that none can be
-    forgotten when one is added. Methods pass the call on. `image_at` and `true_pose` do not: they follow
-    from what the wrapper itself shows.
+    The constructor copies every attribute of `EventDepthSequence`, so that attributes added later are not
+    lost. Methods forward the call, except `image_at` and `true_pose`, which use the wrapper's own data.
     """
 
     def __init__(self, sequence: EventDepthSequence) -> None:
@@ -178,20 +177,19 @@ class WrappedSequence(EventDepthSequence):
         return self._sequence.novel_views()
 
 
-MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface shows something
+MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface is not empty
 ROUNDING = 0.02 + 1e-4  # of the longest interval: 20 Hz in whole milliseconds are at times 51 ms apart
 SAME_TIME = 1e-6  # s; float64 seconds since the epoch are multiples of 2.4e-7
-MANY_OUTSIDE = 0.1  # of the depth images: so many without events around them are worth a note
+MANY_OUTSIDE = 0.1  # a note is made if more than this share of the depth images have no events around them
 
 
 class SampledSequence:
     """A sequence cut to [start, start + duration] and divided into samples.
 
     `start` counts from the first event or depth image, whichever is earlier, so that a recording cut out
-    of a longer one needs no other numbers. A sample ends at every depth image; gaps longer than
-    `max_interval` are divided evenly by samples without depth, unless there are no events to track then.
-    The first sample has depth: images that cannot be used are passed over until there is one. Later ones
-    leave their samples without depth.
+    of a longer one also starts at 0. A sample ends at every depth image. Gaps longer than `max_interval` are
+    divided evenly by samples without depth, unless there are no events to track then. The first sample has
+    depth: unusable images before it are skipped. Later unusable images leave their samples without depth.
     """
 
     def __init__(
@@ -207,7 +205,7 @@ class SampledSequence:
         begin = min([first, *stamps[:1]]) + start
         end = np.inf if duration is None else begin + duration
         inside = stamps[(stamps >= begin - SAME_TIME) & (stamps <= end + SAME_TIME)]
-        if sequence.has_events:  # depth outside their stream has nothing to be tracked with
+        if sequence.has_events:  # depth outside the event stream cannot be tracked
             wanted = len(inside)
             inside = inside[inside >= first + MIN_HISTORY - SAME_TIME]
             inside = inside[inside <= last + max_interval + SAME_TIME]
@@ -234,7 +232,7 @@ class SampledSequence:
             times += [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
             has_depth += [False] * (pieces - 1) + [True]
         self.timestamps = np.array(times)  # [S]
-        self.has_depth = np.array(has_depth)  # [S] bool: there is an image, which may turn out to be useless
+        self.has_depth = np.array(has_depth)  # [S] bool: a depth image exists; it may turn out unusable
         self._depth_index = np.searchsorted(stamps, self.timestamps, side="left")
 
     def __len__(self) -> int:
@@ -245,7 +243,7 @@ class SampledSequence:
 
     def __getitem__(self, k: int) -> Sample:
         sample = self.without_events(k)
-        # The first sample gets a little history so that its time surface is not empty.
+        # The first sample gets some earlier events so that its time surface is not empty.
         previous = float(self.timestamps[k - 1]) if k else sample.timestamp - 0.1
         return replace(sample, events=self.sequence.events(previous, sample.timestamp))
 
@@ -271,7 +269,7 @@ class SampledSequence:
         return Sample(t, events, depth, image, sequence.true_pose(t)), "; ".join(problems)
 
     def without_events(self, k: int) -> Sample:
-        """Return sample k with no events: what it is compared with."""
+        """Return sample k without its events, for evaluation."""
         if not 0 <= k < len(self):
             raise IndexError(k)
         t = float(self.timestamps[k])

@@ -1,4 +1,4 @@
-"""The built-in sequences: simulated once, kept in the user's cache folder."""
+"""The built-in sequences: simulated once and kept in the user's cache folder."""
 
 import hashlib
 from collections.abc import Callable
@@ -10,10 +10,10 @@ from edslam_ti.leftovers import remove_leftovers
 from edslam_ti.simulation import ROOM_NAMES, SimulationConfig, make_path, make_room, simulate
 from edslam_ti.simulation.truth import write_evaluation_truth
 
-GENERATOR_VERSION = 2  # raise it when rooms, paths or rendering change, so that old sequences are remade
+GENERATOR_VERSION = 2  # increase it when rooms, paths or rendering change, so that sequences are made again
 
-# Settings added after GENERATOR_VERSION was last raised: at their defaults they change nothing, and
-# recordings made before them stay valid.
+# Settings added since GENERATOR_VERSION was last increased. Their defaults change nothing, so recordings made
+# before stay valid.
 NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events")
 
 
@@ -36,8 +36,8 @@ def builtin_sequence_folder(
     """Return the folder of a built-in sequence (EventReplica's layout), simulating it on first use.
 
     `progress` receives the share simulated, 0 to 1; without it there is a bar on the terminal.
-    Taichi must have been started. The folder's name holds a hash of the generator's version and of every
-    setting, so changed settings never meet old data.
+    Taichi must have been started. The folder's name contains a hash of the generator's version and of every
+    setting, so changed settings never use old data.
     """
     settings = config or SimulationConfig()
     key = f"{GENERATOR_VERSION} {settings.model_dump_json(exclude=_unchanged(settings))}"
@@ -51,7 +51,7 @@ def builtin_sequence_folder(
         remove_leftovers(other)  # a killed process leaves up to a gigabyte
     room = make_room(scene)
     path = make_path(room, settings)
-    if folder.is_dir():  # simulated before recordings held views beside the path
+    if folder.is_dir():  # simulated before recordings had novel views
         write_evaluation_truth(
             folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
         )

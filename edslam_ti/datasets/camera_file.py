@@ -1,8 +1,8 @@
-"""camera.json: what a recording's files do not say of its camera, its depth and its clock.
+"""camera.json: facts about camera, depth and clock that a recording's other files do not state.
 
-It may hold any of the fields of `CameraFile`; what it leaves out is EventReplica's own camera (event_replica)
-or the layout's (rpg, rgbd). Other keys are for other programs and are passed over, unless they look like one
-of these misspelt.
+It may contain any of the fields of `CameraFile`. For missing fields, EventReplica's own camera
+(event_replica) or the layout's (rpg, rgbd) applies. Other keys belong to other programs and are ignored,
+unless they look like a misspelt field.
 """
 
 import difflib
@@ -19,7 +19,7 @@ from edslam_ti.datasets.files import file_bytes
 from edslam_ti.errors import DataError, plain, shown
 
 DISTORTION_KEYS = ("distortion", "distortion_coefficients", "dist", "k1", "k2", "k3", "p1", "p2")
-LONGEST_KEY = 40  # characters of a key that may be one of ours, misspelt
+LONGEST_KEY = 40  # characters; longer keys are not compared with the fields' names
 
 
 class CameraFile(BaseModel):
@@ -37,19 +37,19 @@ class CameraFile(BaseModel):
     contrast_threshold: float | None = Field(None, ge=1e-3, le=10)
     """C of Eq. 11; also chooses among several event folders."""
     depth_scale: float = Field(1000.0, ge=1e-6, le=1e6)
-    """Units of depth/*.png in a metre (1000: millimetres); below 1, metres in a unit (0.001: the same)."""
+    """Units of depth/*.png per metre (1000: millimetres); below 1, metres per unit (0.001: the same)."""
     invalid: float | None = None
-    """Value in depth images, in their own units, that means no measurement, besides 0 and the largest."""
+    """Value in depth images, in their own units, that means no measurement, as 0 and the largest do."""
     depth_rate: float | None = Field(None, ge=1e-3, le=1e5)
-    """Hz; given, the numbers in the names of depth images are indices, not milliseconds (event_replica)."""
+    """Hz. If given, numbers in the names of depth images are indices, not milliseconds (event_replica)."""
     image_rate: float | None = Field(None, ge=1e-3, le=1e5)
     """Hz; the same for grey images."""
     exposure: float | None = Field(None, ge=0, lt=1)
     """Seconds over which an image integrates, centred on its time; 0: sharp."""
     frame_rate: float = Field(30.0, ge=1e-3, le=1e5)
-    """Images a second, for layouts whose files carry a number but no time (not EventReplica's)."""
+    """Images per second, for layouts whose files have a number but no time (not EventReplica's)."""
     description: str | None = None
-    """What the recording is; simulated ones say so here, and results repeat it. One line, cut if long."""
+    """One line about the recording, repeated in results, cut if long; a simulated one must say that it is."""
 
     @property
     def camera(self) -> Camera:
@@ -62,7 +62,7 @@ class CameraFile(BaseModel):
         return self.depth_scale if self.depth_scale < 1 else 1 / self.depth_scale
 
     def depth_format(self, units_per_metre: float | None = None) -> DepthFormat:
-        """Return what depth values mean; a layout's own unit counts where none is stated."""
+        """Return the meaning of depth values; a layout's own unit applies if none is stated."""
         if units_per_metre is None or "depth_scale" in self.model_fields_set:
             return DepthFormat(self.metres_per_unit, self.invalid)
         return DepthFormat(1 / units_per_metre, self.invalid)
@@ -101,7 +101,7 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds; no key may stand twice in an object."""
+    """Return the contents of a JSON file; no key may occur twice in an object."""
     try:
         text = file_bytes(path, "calibration").decode("utf-8-sig")
         return json.loads(text, object_pairs_hook=_without_repeats)
@@ -117,13 +117,13 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in pairs:
         if key in result:
-            raise ValueError(f"the key '{plain(key, 60)}' stands twice")
+            raise ValueError(f"the key '{plain(key, 60)}' occurs twice")
         result[key] = value
     return result
 
 
 def _check_key(path: Path, key: str, value: object) -> None:
-    """Refuse an unknown key that looks like one of ours misspelt, and any distortion but zero."""
+    """Refuse an unknown key that looks like a misspelt field, and any distortion except zero."""
     close = difflib.get_close_matches(key.lower(), CameraFile.model_fields, n=1, cutoff=0.8)
     if close:
         raise DataError(f"{path}: unknown key '{plain(key)}'; did you mean '{close[0]}'?")

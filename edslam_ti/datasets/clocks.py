@@ -1,8 +1,8 @@
-"""Clocks of a recording: one zero for all its stamps, and a check that they are of one clock.
+"""Clocks of a recording: gives all stamps one zero, and checks that they belong to one clock.
 
-Kernels count integer microseconds in 32 bits. A recording whose first event is later than `LATEST_START`
-(stamps since the epoch or since boot) is therefore shifted, by whole seconds, so that differences of stamps
-stay what they were to the last bit.
+Kernels count integer microseconds in 32 bits. Therefore a recording whose first event is later than
+`LATEST_START` (stamps since the epoch or since boot) is shifted. The shift is in whole seconds, which
+preserves differences of stamps to the last bit.
 """
 
 import math
@@ -13,12 +13,12 @@ import numpy as np
 from edslam_ti.datasets.base import EventDepthSequence, stamp_text
 from edslam_ti.errors import DataError
 
-LATEST_START = 1000.0  # s; the microseconds end at 2147 s
-OTHER_UNIT = 300  # times as long or short: milliseconds taken for seconds, and worse
+LATEST_START = 1000.0  # s; 32-bit microseconds overflow at 2147 s
+OTHER_UNIT = 300  # stamps whose span is this many times longer or shorter are in another unit
 UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 LITTLE = 0.5  # of the events' time
-VERY_LITTLE = 0.15  # indices of 100 images a second, taken for milliseconds, span a tenth of their time
-FASTEST_DEPTH = 100.0  # Hz; depth cameras make up to 90 images a second
+VERY_LITTLE = 0.15  # at 100 images per second, indices read as milliseconds span a tenth of the true time
+FASTEST_DEPTH = 100.0  # Hz; depth cameras take up to 90 images per second
 
 
 def clock_offset(first: float) -> float:
@@ -32,7 +32,7 @@ def check_clock(
     name: str,  # of the file or the folder, for messages
     stamps: np.ndarray,  # [N] s, increasing, shifted as the sequence's
 ) -> None:
-    """Refuse stamps that do not lie at the events' times: they are of another clock, or in another unit."""
+    """Refuse stamps outside the events' times: they belong to another clock, or are in another unit."""
     if len(stamps) == 0:
         return
     first, last = sequence.time_range
@@ -64,7 +64,7 @@ def check_milliseconds(
     numbers: list[int],  # of their names, increasing
     rate: str,  # the key of camera.json that states their rate
 ) -> None:
-    """Refuse numbers that are indices and not milliseconds: their span is small beside that of the events."""
+    """Refuse numbers that are indices, not milliseconds: their span is far shorter than the events'."""
     steps = np.diff(np.array(numbers, float))
     first, last = sequence.time_range
     if len(steps) == 0:
@@ -73,7 +73,7 @@ def check_milliseconds(
     is_steady = len(steps) > 1 and bool((steps == steps[0]).all())
     is_fast = np.median(steps) <= 1000 / FASTEST_DEPTH
     is_short = is_fast and length < LITTLE * duration
-    # Other factors are those of milliseconds and seconds: `check_clock` says so.
+    # `check_clock` handles other factors, those between milliseconds and seconds.
     is_shorter = is_steady and duration / OTHER_UNIT < length < VERY_LITTLE * duration
     if not is_short and not is_shorter:
         return
@@ -86,7 +86,7 @@ def check_milliseconds(
 
 
 def note_coverage(sequence: EventDepthSequence) -> None:
-    """Note where depth covers less than half of the events' time."""
+    """Add a note if depth covers less than half of the events' time."""
     first, last = sequence.time_range
     stamps = sequence.depth_timestamps
     duration = last - first

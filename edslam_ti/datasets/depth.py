@@ -1,10 +1,10 @@
-"""Depth images as sensors and renderers write them: what is depth in them, and what means that there is none.
+"""Reads depth images as sensors and renderers write them, and decides which values mean missing depth.
 
 PNG: 16 bits, one channel, in a stated unit. OpenEXR: metres, float or half, in a channel Z, V, Y or R.
 
-Missing are 0, negative values, NaN and infinity, the largest value of the type (65535 in PNG: "no
-measurement" or "beyond the range", 65504 in half floats), all from 10 km on (renderers write 1e10 where they
-hit nothing), and the value that camera.json states as `invalid`.
+These values count as missing: 0, negative values, NaN and infinity, the largest value of the type (65535 in
+PNG: "no measurement" or "beyond the range", 65504 in half floats), 10 km and more (renderers write 1e10 where
+nothing is hit), and the value that camera.json states as `invalid`.
 """
 
 import io
@@ -21,27 +21,27 @@ from edslam_ti.datasets.files import check_size, decode, file_bytes, quiet
 from edslam_ti.errors import DataError
 
 FARTHEST_DEPTH = 1e4  # m
-LOOKED_AT = 8  # depth images, and grey ones, that are read when a sequence is opened
-NEARLY_ALL = 0.8  # of them
+LOOKED_AT = 8  # depth images, and as many grey images, that are read when a sequence is opened
+NEARLY_ALL = 0.8  # of these images
 
 
 @dataclass(frozen=True)
 class DepthFormat:
-    """What the numbers in depth images mean."""
+    """Meaning of the numbers in depth images."""
 
     metres_per_unit: float  # PNG
-    invalid: float | None = None  # in the file's own units: stands for no measurement, too
+    invalid: float | None = None  # in the file's own units; another value that means no measurement
 
 
 def read_depth(path: Path, camera: Camera, format: DepthFormat) -> np.ndarray:  # [H, W] float32, m
     """Return a depth image in metres, 0 = missing.
 
-    Raises `FileNotFoundError`, and `DataError` for what is no depth image of the camera's size.
+    Raises `FileNotFoundError`, and `DataError` if the file is no depth image of the camera's size.
     """
     if path.suffix.lower() == ".exr":
         depth = _decode_exr(path, camera)
         with np.errstate(invalid="ignore"):
-            is_measured = (depth > 0) & (depth < FARTHEST_DEPTH)  # not so for NaN
+            is_measured = (depth > 0) & (depth < FARTHEST_DEPTH)  # False for NaN
         if format.invalid is not None:
             is_measured &= depth != np.float32(format.invalid)
         return np.where(is_measured, depth, np.float32(0))
@@ -72,7 +72,7 @@ def _decode_exr(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32
         with quiet():
             (left, top), (right, bottom) = OpenEXR.File(source, header_only=True).header()["dataWindow"]
             shape = (int(bottom) - int(top) + 1, int(right) - int(left) + 1)
-        check_size(path, shape, camera, "depth")  # before a few bytes that promise gigabytes are believed
+        check_size(path, shape, camera, "depth")  # before allocating: a few bytes may claim gigabytes
         if isinstance(source, io.BytesIO):
             source.seek(0)
         with quiet(), OpenEXR.File(source, separate_channels=True) as file, np.errstate(all="ignore"):
@@ -94,9 +94,9 @@ def _decode_exr(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32
 def look_at_images(sequence: EventDepthSequence, folder: Path) -> None:
     """Read a few depth and grey images of a sequence that is being opened; set its `depth_varies`.
 
-    Raises `DataError` where most of them cannot be read, and where (nearly) all the depth images show one
-    and the same value or none: a sensor that was covered or saturated, or no depth at all. Images that show
-    one value each, but not the same, are a flat wall seen at right angles.
+    Raises `DataError` if most of them cannot be read, or if (nearly) all depth images show the same single
+    value or none: the sensor was covered or saturated, or the images are no depth. Images that show one value
+    each, but different ones, are accepted: they may show a flat wall seen at right angles.
     """
     _read_some(len(sequence.image_timestamps), sequence.image, "grey images")
     depths = _read_some(len(sequence.depth_timestamps), sequence.depth, "depth images")
@@ -114,7 +114,7 @@ def look_at_images(sequence: EventDepthSequence, folder: Path) -> None:
 
 
 def _read_some(number: int, read: Callable[[int], np.ndarray], what: str) -> list[np.ndarray]:
-    """Return a few images spread over a sequence that can be read; raise if most cannot."""
+    """Return a few evenly spaced images of a sequence, without unreadable ones; raise if most are."""
     indices = np.unique(np.linspace(0, number - 1, LOOKED_AT).astype(int)) if number else np.empty(0, int)
     images: list[np.ndarray] = []
     errors: list[DataError | OSError] = []

@@ -1,4 +1,4 @@
-"""Checking and sorting a stream of events: bad rows are left out and counted, too many are refused."""
+"""Checks and sorts a stream of events; leaves out and counts bad rows, and refuses too many of them."""
 
 import itertools
 from collections import deque
@@ -14,13 +14,14 @@ from edslam_ti.events import Events
 
 DISORDER = 5e-3  # s: simulators sort in blocks of 1 ms or so, not globally (gray_events_data.npy)
 LONGEST_RECORDING = 2e5  # s: a longer span means that the stamps are not in seconds
-MOST_BAD = 0.01  # share of the rows; more is no accident but another format
-WINDOW = 8  # blocks, about a million rows, in which more than that share is refused at once
-NEIGHBOURS = 16  # events on either side that tell whether a stamp is out of place
-ORDERS = ("xytp", "txyp", "xypt")  # of columns, as programs write them
-ENOUGH_TO_TELL = 100  # rows, for an order that is not the expected one
-# A few stamps at either end of a recording are of another time (left over from before, or a broken last
-# row) where so long a gap, in seconds and in lengths of the recording, divides them from the rest.
+MOST_BAD = 0.01  # share of the rows; more bad rows mean that the file has another format
+WINDOW = 8  # blocks, about a million rows, in which a larger share of bad rows is refused at once
+NEIGHBOURS = 16  # events on either side with which a stamp is compared
+ORDERS = ("xytp", "txyp", "xypt")  # orders of columns that programs write
+ENOUGH_TO_TELL = 100  # rows needed to detect an order that is not the expected one
+# A few stamps at either end of a recording may belong to another time (left over from before, or a broken
+# last row). They do if a gap of this length, in seconds and in lengths of the recording, separates them from
+# the rest.
 OTHER_TIME, OTHER_TIME_LENGTHS = 60.0, 10.0
 AT_ONCE = 65_536  # stamps whose neighbours are compared at once
 
@@ -30,22 +31,22 @@ class BadRows:
     """Rows that were left out."""
 
     number: int = 0
-    first: str = ""  # which, its values, and what was expected
+    first: str = ""  # the first one: its number, its values, and what was expected
 
 
 @dataclass(frozen=True)
 class Columns:
-    """What a file's columns hold."""
+    """Meaning of a file's columns."""
 
     order: str  # such as "xytp"
-    negative: float | None  # what the file writes for polarity -1: -1 or 0; None where it has none
+    negative: float | None  # the file's number for polarity -1: -1 or 0; None: no negative event
 
     def index(self, name: str) -> int:
         return self.order.index(name)
 
 
 def recognised_columns(source: EventSource, size: tuple[int, int]) -> Columns:
-    """Return the order of columns, found from the values where the expected one does not fit.
+    """Return the order of columns, detected from the values if the expected order does not fit.
 
     Raises `DataError` for times that are not in seconds.
     """
@@ -62,7 +63,7 @@ def recognised_columns(source: EventSource, size: tuple[int, int]) -> Columns:
 
 
 def _fits(rows: np.ndarray, order: str, size: tuple[int, int]) -> bool:  # [S, 4]
-    """Return whether nearly all rows make sense in an order of columns."""
+    """Return whether nearly all rows are plausible in an order of columns."""
     x, y, t, p = (rows[:, order.index(name)] for name in "xytp")
     negative = _negative(p)
     with np.errstate(invalid="ignore"):
@@ -76,7 +77,7 @@ def _fits(rows: np.ndarray, order: str, size: tuple[int, int]) -> bool:  # [S, 4
 
 
 def _negative(polarity: np.ndarray) -> float | None:
-    """Return what stands for negative events: the more frequent of -1 and 0."""
+    """Return the number for negative events: the more frequent of -1 and 0."""
     minus, zero = int((polarity == -1).sum()), int((polarity == 0).sum())
     return None if minus + zero == 0 else -1.0 if minus >= zero else 0.0
 
@@ -90,11 +91,11 @@ def _refuse_unit(source: EventSource, order: str, span: float) -> NoReturn:
 
 
 class EventChecker:
-    """Makes sorted events of a file's rows.
+    """Turns a file's rows into sorted events.
 
-    A row is bad where its pixel is outside the image or no pixel, its time not finite or out of place, or
-    its polarity neither of the two. Stamps may be out of order by up to `DISORDER`. More than `MOST_BAD`
-    bad rows, of all or of about a million, are refused.
+    A row is bad if its pixel is outside the image or not an integer, its time not finite or out of place, or
+    its polarity neither of the two. Stamps may be out of order by up to `DISORDER`. The file is refused if
+    the share of bad rows, among all or among about a million, exceeds `MOST_BAD`.
     """
 
     def __init__(self, source: EventSource, size: tuple[int, int], columns: Columns) -> None:
@@ -122,7 +123,7 @@ class EventChecker:
         yield self._sorted_until(np.inf)
 
     def checked(self) -> Iterator[tuple[Events, np.ndarray]]:
-        """Yield for every block its good events in the order of the file, and which rows they are (bool)."""
+        """Yield for every block its good events in the order of the file, and a mask of their rows (bool)."""
         blocks = itertools.chain(self._source.blocks(), [None])
         for block, following in itertools.pairwise(blocks):
             if block is None:
@@ -146,7 +147,7 @@ class EventChecker:
         number = int(np.searchsorted(events.t, end))
         rest = events[number:]
         self._held = [rest]
-        # Twice as many as stay each time, so that a burst is not sorted again and again.
+        # Wait for twice as many as remain, so that a burst is not sorted again and again.
         self._merge_at = 2 * len(rest) + BLOCK // 2
         return events[:number]
 
@@ -159,7 +160,7 @@ class EventChecker:
             self._negative = _negative(p)
         positive = p == 1
         is_place = (column == x) & (row == y)
-        # As unsigned numbers negative ones are large.
+        # Negative numbers are large as unsigned ones.
         is_place &= (column.view(np.uint16) < self._size[0]) & (row.view(np.uint16) < self._size[1])
         is_sign = positive if self._negative is None else positive | (p == self._negative)
         is_time = np.isfinite(t)
@@ -177,7 +178,7 @@ class EventChecker:
         return (events if good.all() else events[good]), good
 
     def _take_in(self, block: RowBlock, good: np.ndarray, t: np.ndarray) -> None:
-        """Refuse stamps [M] of good rows that are not in order or not in seconds, note the newest."""
+        """Refuse stamps [M] of good rows that are out of order or not in seconds; record the newest."""
         if len(t) == 0:
             return
         if np.isnan(self._oldest):
@@ -201,7 +202,7 @@ class EventChecker:
     def _out_of_place(
         self, t: np.ndarray, good: np.ndarray, following: RowBlock | None
     ) -> np.ndarray | None:  # [N], [N] -> [N] bool
-        """Return which good stamps are out of order and far from their neighbours', None where none is."""
+        """Return which good stamps are out of order and far from their neighbours; None: no stamp is."""
         after = np.empty(0)
         if following is not None:
             after = following.rows[:NEIGHBOURS, self._columns.index("t")].astype(np.float64)
@@ -216,7 +217,8 @@ class EventChecker:
         stamps = np.concatenate([self._recent, stamps])
         is_wrong = _is_out_of_order(stamps, np.ones(len(stamps), bool))
         is_wrong &= np.abs(stamps - _running_median(stamps)) > DISORDER
-        # A good stamp beside a gap and a bad one may be far from its median: it is in order without the bad.
+        # A good stamp next to a gap and a bad stamp may be far from its median. Without the bad stamp it is
+        # in order.
         is_wrong &= _is_out_of_order(stamps, ~is_wrong)
         first = len(self._recent)
         result = np.zeros(len(t), bool)
@@ -224,7 +226,7 @@ class EventChecker:
         return result
 
     def _at_ends(self, t: np.ndarray, good: np.ndarray, is_end: bool) -> np.ndarray | None:  # [N] bool
-        """Return which stamps of a block in order are of another time than the recording, None for none."""
+        """Return which stamps of a sorted block belong to another time than the recording; None: no stamp."""
         index = np.flatnonzero(good)
         first, last = 0, len(index)
         if np.isnan(self._oldest):
@@ -246,7 +248,7 @@ class EventChecker:
         return result
 
     def _count_bad(self, block: RowBlock, good: np.ndarray, checks: list[np.ndarray]) -> None:
-        """Note the first bad row, and refuse the block if it has too many."""
+        """Record the first bad row, and refuse the block if it has too many."""
         width, height = self._size
         expected = [
             f"x in 0 to {width - 1} and y in 0 to {height - 1}",
@@ -273,7 +275,7 @@ class EventChecker:
             self._refuse(f"{self._typical}; {bad} of {rows} {self._source.counted}s are bad")
 
     def _described(self, block: RowBlock, k: int, expected: str) -> str:
-        """Return which row k of the block is, what was expected and what it holds."""
+        """Return a text with the number of row k of the block, what was expected, and its values."""
         where = f"{self._source.counted} {block.numbers[k]}"
         names = self._columns.order
         if k in block.unreadable:
@@ -290,14 +292,14 @@ class EventChecker:
 
 
 def sorted_by_time(events: Events) -> Events:
-    """Return events sorted by time; those of one time stay in their order."""
+    """Return events sorted by time (stable)."""
     if len(events) == 0 or (events.t[1:] >= events.t[:-1]).all():
         return events
     return events[np.argsort(events.t, kind="stable")]
 
 
 def _is_out_of_order(stamps: np.ndarray, among: np.ndarray) -> np.ndarray:  # [N], [N] bool -> [N] bool
-    """Return which stamps are earlier than one before them, or later than one behind, `among` some."""
+    """Return which stamps are earlier than one before or later than one after them, compared `among` some."""
     before = np.maximum.accumulate(np.where(among, stamps, -np.inf))
     behind = np.minimum.accumulate(np.where(among, stamps, np.inf)[::-1])[::-1]
     return (stamps < before - DISORDER) | (stamps > behind + DISORDER)
@@ -306,8 +308,8 @@ def _is_out_of_order(stamps: np.ndarray, among: np.ndarray) -> np.ndarray:  # [N
 def _running_median(values: np.ndarray) -> np.ndarray:  # [N] -> [N]
     """Return the median of each value and `NEIGHBOURS` on either side.
 
-    Beyond the ends stamps count as earlier and later than all, so that the median of sorted stamps is
-    each stamp itself, whatever gaps they have.
+    Values beyond the ends count as earlier and later than all, so that the median of sorted stamps is each
+    stamp itself, whatever the gaps.
     """
     ends = np.full(NEIGHBOURS, np.inf)
     windows = np.lib.stride_tricks.sliding_window_view(

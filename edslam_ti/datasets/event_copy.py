@@ -1,16 +1,16 @@
-"""Compact copies of checked events in the user's cache: four raw arrays in a folder, 13 bytes an event.
+"""Compact copies of checked events in the user's cache: four raw arrays in a folder, 13 bytes per event.
 
     x.bin, y.bin     int16     pixel
     t.bin            float64   seconds as the file states them, ascending
     polarity.bin     int8      -1 or +1
-    events.json      number of events, and what was left out
+    events.json      number of events, and rows that were left out
 
-Seconds stay float64: whole microseconds would take as much and change the stamps of simulated recordings,
-which are in nanoseconds or float32.
+Seconds stay float64. Whole microseconds would take as much space, and change the stamps of simulated
+recordings, which are in nanoseconds or float32.
 
-A copy is known by the path, size and time of change of its source. It is written under a temporary name,
-which holds the process's number, so that what a killed process leaves is never taken for finished and is
-removed by the next one.
+A copy is identified by the path, size and modification time of its source. It is written under a temporary
+name that contains the process's number. So the remains of a killed process are never taken for a finished
+copy, and the next process removes them.
 """
 
 import contextlib
@@ -31,17 +31,17 @@ import numpy as np
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 
-VERSION = 1  # raise it when the checks change, so that old copies are made again
+VERSION = 1  # increase it when the checks change, so that copies are made again
 DTYPES = {n: np.dtype(d) for n, d in (("x", "<i2"), ("y", "<i2"), ("t", "<f8"), ("polarity", "i1"))}
 BYTES_PER_EVENT = sum(dtype.itemsize for dtype in DTYPES.values())
 DESCRIPTION = "events.json"
-CHECKED_AT_ONCE = 100_000  # events; what is made of them stays in a core's cache
-SPARE_ROOM = 100_000_000  # bytes that a copy leaves free
+CHECKED_AT_ONCE = 100_000  # events; intermediate results stay in a core's cache
+SPARE_ROOM = 100_000_000  # bytes that a copy leaves free on the disk
 
 
 @dataclass(frozen=True)
 class CopySummary:
-    """What is known of checked events besides themselves."""
+    """Facts about checked events."""
 
     num_events: int
     num_rows: int  # of the source
@@ -65,18 +65,18 @@ class EventsInMemory:
 
 
 class MappedEvents:
-    """The sorted events of a copy. Slices are mapped: what they show is read when it is looked at."""
+    """The sorted events of a copy. Slices are memory-mapped: data is read on access."""
 
     def __init__(self, folder: Path, size: tuple[int, int]) -> None:
         self._folder = folder
         self._size = size
-        # Files stay open: a copy that is removed or replaced meanwhile can still be read.
+        # Files stay open, so that a copy can still be read after it was removed or replaced.
         self._files = {name: (folder / f"{name}.bin").open("rb") for name in DTYPES}
 
     def between(self, start: float, end: float) -> Events:
         """Return the events with start <= t < end, read-only.
 
-        The copy is mapped afresh for each slice, so that the pages it touched leave the process with it.
+        Each slice has a mapping of its own, so that its pages leave the process with it.
         """
         events = self._all().between(start, end)
         for piece in events.pieces(CHECKED_AT_ONCE):
@@ -92,9 +92,9 @@ class MappedEvents:
         return Events(**{name: _mapped(self._files[name], dtype) for name, dtype in DTYPES.items()})
 
     def _check(self, events: Events) -> None:
-        """Refuse numbers that a damaged disk has put there: kernels would write outside their images."""
+        """Refuse values from a damaged disk, with which kernels would write outside their images."""
         width, height = self._size
-        # As unsigned numbers negative ones are large; -1 and 1 are 0 and 2 when one is added.
+        # Negative numbers are large as unsigned ones; adding one turns -1 and 1 into 0 and 2.
         is_inside = events.x.view(np.uint16).max() < width and events.y.view(np.uint16).max() < height
         sign = (events.polarity + np.int8(1)).view(np.uint8)
         is_sign = sign.max() <= 2 and not (sign & 1).any()
@@ -110,7 +110,7 @@ class EventCopy:
     """The compact copy of one source in a folder of copies."""
 
     def __init__(self, parent: Path, source: Path, size: tuple[int, int], settings: str) -> None:
-        """`settings` is whatever else the copy depends on."""
+        """`settings` names everything else that the copy depends on."""
         self._parent = parent
         self._source = source
         status = source.stat()
@@ -120,7 +120,7 @@ class EventCopy:
         self.folder = parent / f"{self._prefix}{state}"
 
     def read(self) -> CopySummary | None:
-        """Return what the copy says of itself, None where there is none or it is damaged."""
+        """Return the copy's summary; None: there is no copy, or it is damaged."""
         try:
             values = json.loads((self.folder / DESCRIPTION).read_text(encoding="utf-8"))
             summary = CopySummary(**values | {"notes": tuple(values["notes"])})
@@ -137,9 +137,9 @@ class EventCopy:
         return shutil.disk_usage(self._parent).free > most_events * BYTES_PER_EVENT + SPARE_ROOM
 
     def write(self, parts: Iterable[Events], summary: Callable[[int], CopySummary]) -> CopySummary:
-        """Write the copy; it stands under its name when it is complete. Raises `OSError`.
+        """Write the copy, which gets its name when it is complete. Raises `OSError`.
 
-        `summary` is called with the number of events when all have been written.
+        `summary` is called with the number of events after all have been written.
         """
         self._parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self._parent)
@@ -153,7 +153,7 @@ class EventCopy:
                     for name, dtype in DTYPES.items():
                         files[name].write(np.ascontiguousarray(getattr(part, name), dtype).data)
                     number += len(part)
-                for file in files.values():  # a power cut must not leave a complete name over zeros
+                for file in files.values():  # after a power cut no finished copy may contain zeros
                     file.flush()
                     os.fsync(file.fileno())
             result = summary(number)
@@ -164,7 +164,7 @@ class EventCopy:
         return result
 
     def _replace(self, partial: Path) -> None:
-        """Give a finished copy its name; remove damaged and outdated copies of the same source."""
+        """Rename a finished copy; remove damaged and outdated copies of the same source."""
         for old in self._parent.glob(f"{self._prefix}*"):
             if old != self.folder or self.read() is None:
                 shutil.rmtree(old, ignore_errors=True)

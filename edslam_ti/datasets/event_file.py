@@ -1,4 +1,4 @@
-"""Events of one file, read slice by slice however large it is."""
+"""Events of one file of any size, read slice by slice."""
 
 import copy
 import logging
@@ -23,7 +23,7 @@ from edslam_ti.datasets.event_text import TextRows
 from edslam_ti.errors import DataError
 from edslam_ti.events import Events
 
-IN_MEMORY = 2_000_000  # rows of an array that are checked anew each time; a quarter of a second
+IN_MEMORY = 2_000_000  # rows; smaller arrays are checked each time, which takes a quarter of a second
 SLOW = 50_000_000  # bytes; longer files show a bar while they are checked
 TYPICAL_LINE = 15  # bytes of a line of text with an event, to estimate how many there are
 
@@ -33,14 +33,14 @@ Progress = Callable[[float], None]  # receives the share done, 0 to 1
 
 
 class EventFile:
-    """Sorted events of an `.npy` array or a text, which is checked once and then read from a compact copy.
+    """Sorted events of an `.npy` array or a text file, checked once and then read from a compact copy.
 
-    Rows are pixel column, pixel row, seconds, polarity in {-1, +1} or {0, 1}; of a text: seconds first.
-    Bad rows are left out: `num_dropped` and `notes` tell how many and why. Stamps may be out of order by up
-    to `DISORDER`; slices come out sorted and exact.
+    Rows are pixel column, pixel row, seconds, polarity in {-1, +1} or {0, 1}; in a text, seconds come first.
+    Bad rows are left out; `num_dropped` and `notes` state how many and why. Stamps may be out of order by up
+    to `DISORDER`; slices are sorted and exact.
 
-    A slice of the copy is mapped, not read into memory: 1e8 events in one slice take no memory of their own
-    unless stamps are shifted, which takes 8 bytes an event. `shift` seconds are subtracted from every stamp.
+    A slice of the copy is memory-mapped: 1e8 events in one slice take no memory of their own unless stamps
+    are shifted, which takes 8 bytes per event. `shift` seconds are subtracted from every stamp.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class EventFile:
     ) -> None:
         """`progress` follows the first reading of a large file; without it there is a bar on the terminal.
 
-        Raises `DataError` for files that hold no events, too many bad ones, or times in another unit.
+        Raises `DataError` for files without events, with too many bad rows, or with times in another unit.
         """
         self.path = path
         self.shift = 0.0
@@ -91,12 +91,12 @@ class EventFile:
 
 
 class CheckedRows:
-    """Good events of an array without a copy: every slice is read from the array and sorted anew."""
+    """Good events of an array without a copy: every slice is read from the array and sorted again."""
 
     def __init__(self, rows: NpyRows, checker: EventChecker, progress: Progress) -> None:
         self._rows = rows
         self._checker = checker
-        self._dropped: dict[int, np.ndarray] = {}  # by block: which of its rows are good (bool)
+        self._dropped: dict[int, np.ndarray] = {}  # mask of good rows (bool) by block
         first, last, self.num_events = [], [], 0
         for k, (events, good) in enumerate(checker.checked()):
             progress(checker.share)
@@ -105,7 +105,8 @@ class CheckedRows:
             self.num_events += len(events)
             first.append(float(events.t.min()) if len(events) else np.inf)
             last.append(float(events.t.max()) if len(events) else -np.inf)
-        # Blocks overlap by the disorder: the earliest stamp from a block on, and the latest up to it.
+        # Disorder makes blocks overlap in time: keep the earliest stamp from each block on, and the latest up
+        # to it.
         self._first = np.minimum.accumulate(first[::-1])[::-1]
         self._last = np.maximum.accumulate(last)
 
@@ -129,7 +130,7 @@ class CheckedRows:
 def _checked(
     source: NpyRows | TextRows, size: tuple[int, int], progress: Progress | None
 ) -> tuple[EventsInMemory | MappedEvents | CheckedRows, CopySummary]:
-    """Return a file's good events: from its copy, which is made where there is none, or without one."""
+    """Return a file's good events: from its copy, which is made if missing, or without a copy."""
     is_small = isinstance(source, NpyRows) and len(source) <= IN_MEMORY
     stored = EventCopy(cache_folder() / "events", source.path, size, source.columns)
     if not is_small:
@@ -142,7 +143,7 @@ def _checked(
     def summarised(num_events: int) -> CopySummary:
         notes = list(source.notes) if isinstance(source, TextRows) else []
         if columns.order != source.columns:
-            notes.append(f"columns look like {' '.join(columns.order)} and are read so")
+            notes.append(f"columns look like {' '.join(columns.order)} and are read in that order")
         notes += _bad_rows_note(checker.bad, checker.num_rows, source.counted)
         dropped = checker.bad.number + (len(source.notes) if isinstance(source, TextRows) else 0)
         if num_events == 0:
@@ -165,7 +166,7 @@ def _checked(
             except OSError as error:
                 reason = str(error.strerror or error)
             logger.warning(
-                "%s: no copy of its events in %s (%s); they are checked anew each time",
+                "%s: no copy of its events in %s (%s); they are checked again each time",
                 *(source.path, stored.folder.parent, reason),
             )
             checker = EventChecker(source, size, columns)
@@ -185,7 +186,7 @@ def _bad_rows_note(bad: BadRows, num_rows: int, counted: str) -> list[str]:
 
 @contextmanager
 def _bar(path: Path, progress: Progress | None) -> Iterator[Progress]:
-    """Show a bar for a large file, unless the caller follows the progress."""
+    """Show a bar for a large file, unless the caller receives the progress."""
     if progress is not None:
         yield progress
     elif path.stat().st_size < SLOW:

@@ -8,17 +8,17 @@
     Depth_exr/*.exr                            metres (used when there is no depth/frame*.png)
     camera.json                                optional
     novel_views/{images,depth}/frameNNNNNN.png, novel_views/traj.txt
-                                               true views beside the path (same units), optional
+                                               novel views: true views near the path, optional
     surfaces.ply                               true surfaces, metres, optional
 
-NNNNNN is the time in milliseconds, with any number of digits. Where it is an index, the times stand in
+NNNNNN is the time in milliseconds, with any number of digits. If it is an index, the times are in
 depth/timestamps.txt and images/timestamps.txt (lines 'number_or_name seconds'), or follow from a rate
 (`depth_rate` and `image_rate`, Hz, of `camera.json` or of the constructor): image N is taken N / rate seconds
-after 0, or after the first event where the events' clock does not begin with the recording.
+after 0, or after the first event if the events' clock does not start with the recording.
 
-camera.json: see camera_file.py; what it leaves out is EventReplica's own camera. With centres at "half"
-(EventReplica's, seen from cx = width / 2) the first pixel is centred at (0.5, 0.5); the sequence's `camera`
-has them at integers. Depth: see depth.py for what counts as missing.
+camera.json: see camera_file.py; for missing fields EventReplica's own camera applies. With centres at "half"
+(EventReplica's, as cx = width / 2 shows) the first pixel is centred at (0.5, 0.5); the sequence's `camera`
+has centres at integers. Depth: depth.py says which values count as missing.
 
 Clock: the files' own, in seconds; a late one is shifted (clocks.py), and `time_offset` holds the shift.
 """
@@ -45,7 +45,7 @@ THRESHOLD = "event_threshold_"
 class EventReplicaSequence(EventDepthSequence):
     """A folder in EventReplica's layout; any scene name works.
 
-    Where the folder holds events simulated with several thresholds, `contrast_threshold` chooses one.
+    If the folder holds events simulated with several thresholds, `contrast_threshold` chooses one.
     """
 
     dataset = "event_replica"
@@ -82,7 +82,7 @@ class EventReplicaSequence(EventDepthSequence):
         self.truth = self._read_truth(folder)
         if self.truth is not None:
             check_clock(self, folder, "poses_ts.txt", self.truth.timestamps)
-        look_at_images(self, folder)  # what is wrong shows now, not in the middle of a run
+        look_at_images(self, folder)  # find faults now, not in the middle of a run
 
     @property
     def time_range(self) -> tuple[float, float]:
@@ -140,7 +140,7 @@ class EventReplicaSequence(EventDepthSequence):
         image_rate = image_rate or calibration.image_rate
         if rate and not image_rate and images and list(images) == list(depth):
             image_rate = rate
-            self.note(f"{image_folder}: numbered as depth is: taken at the same {rate:g} Hz")
+            self.note(f"{image_folder}: numbered like depth: assumed at the same rate, {rate:g} Hz")
         self._image_files, self.image_timestamps = self._with_times(
             image_folder, images, image_rate, "image_rate"
         )
@@ -157,7 +157,7 @@ class EventReplicaSequence(EventDepthSequence):
         elif rate:
             name = f"{folder.name} (at {rate:g} Hz)"
             first = self.time_range[0]
-            origin = 0.0 if 0 <= first < 1 and not offset else first  # clocks begin at 0, or with the events
+            origin = 0.0 if 0 <= first < 1 and not offset else first  # clocks start at 0, or with the events
             times = np.array([origin + number / rate for number in numbers])
         else:
             times = np.array([(number - 1000 * offset) / 1000 for number in numbers])

@@ -1,4 +1,4 @@
-"""Events as a file holds them: blocks of rows of an `.npy` array, in the file's own order of columns."""
+"""Reads events of an `.npy` array in blocks of rows, in the file's own order of columns."""
 
 import tokenize
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,8 +10,8 @@ import numpy as np
 
 from edslam_ti.errors import DataError
 
-BLOCK = 131_072  # rows; of four float64 each they fit in a core's cache
-PROBES = 32  # pieces of PROBE_LENGTH rows that tell the order of columns and the unit of time
+BLOCK = 131_072  # rows; with four float64 each they fit in a core's cache
+PROBES = 32  # pieces of PROBE_LENGTH rows from which the order of columns and the unit of time are detected
 PROBE_LENGTH = 2048
 LONGEST_REASON = 200  # characters of another library's message
 FIELD_NAMES = {  # of structured arrays
@@ -27,31 +27,31 @@ class RowBlock:
     """Consecutive rows."""
 
     rows: np.ndarray  # [N, 4] of any floating type
-    numbers: Sequence[int]  # [N] what the user's own file counts them as
-    unreadable: dict[int, str] = field(default_factory=dict)  # text of rows that hold no four numbers
+    numbers: Sequence[int]  # [N] number of each row in the user's own file
+    unreadable: dict[int, str] = field(default_factory=dict)  # text of rows that are not four numbers
     share: float = 0.0  # of the file that has been read, 0 to 1
 
 
 class EventSource(Protocol):
     """A file of events with four numbers each."""
 
-    name: str  # of the file the user knows
+    name: str  # of the user's own file
     columns: str  # the expected order, such as "xytp"
-    counted: str  # what messages count: "row" or "line"
+    counted: str  # unit in messages: "row" or "line"
 
     def blocks(self) -> Iterator[RowBlock]:
         """Yield all rows in the order of the file."""
 
     def sample(self) -> np.ndarray:  # [S, 4] float64
-        """Return rows that stand for the file, in its order."""
+        """Return representative rows of the file, in its order."""
 
     def column(self, index: int) -> str:
-        """Return how the user calls a column."""
+        """Return a column's name in messages."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the array lies in the file."""
+    """Position and type of the array in the file."""
 
     dtype: np.dtype
     num_rows: int
@@ -147,7 +147,7 @@ def _read_layout(path: Path) -> _Layout:
     expected = offset + shape[0] * layout.row_bytes
     if size < expected:
         raise DataError(
-            f"{path}: truncated: the header promises {shape[0]} events ({expected} bytes), the file has "
+            f"{path}: truncated: the header states {shape[0]} events ({expected} bytes), the file has "
             f"{size} bytes, {max(0, size - offset) // layout.row_bytes} events; copy or download it again"
         )
     return layout
@@ -165,7 +165,7 @@ def _read_header(path: Path) -> tuple[tuple[int, ...], bool, np.dtype, int]:
             )
             return *read(file), file.tell()
         except (
-            # What numpy lets through of its header's parser, besides its own ValueError.
+            # Besides its own ValueError, numpy lets these errors of its header's parser through.
             *(ValueError, OSError, SyntaxError, TypeError, tokenize.TokenError),
             *(RecursionError, MemoryError, OverflowError, EOFError),
         ) as error:

@@ -1,4 +1,4 @@
-"""Events in a text file, one a line; comments, a header and damaged lines are recognised."""
+"""Reads events of a text file, one per line; detects comments, a header and damaged lines."""
 
 import io
 import warnings
@@ -13,21 +13,21 @@ from edslam_ti.errors import DataError
 CHUNK = 4_000_000  # characters read at once, some 200,000 lines
 LONGEST_LINE = 10_000  # characters; a longer one is cut into several
 SHOWN = 60  # characters of a line in messages
-PIECE = 256  # lines of a chunk with unreadable ones that are tried together
+PIECE = 256  # a chunk with unreadable lines is read in pieces of this many lines
 SEPARATORS = str.maketrans(",;", "  ")
 HEADER_WORDS = {"t", "ts", "time", "timestamp", "x", "y", "p", "pol", "polarity"}
-# Byte-order marks of UTF-16 and UTF-32, as Latin-1 shows them.
+# Byte-order marks of UTF-16 and UTF-32, decoded as Latin-1.
 WIDE_MARKS = ("\xff\xfe", "\xfe\xff", "\x00\x00\xfe\xff")
 
 
 class TextRows:
-    """Lines 't x y p'. Blank lines, lines from '#' on, and a first line 'width height' are no events."""
+    """Lines 't x y p'. Blank lines, text after '#', and a first line 'width height' are skipped."""
 
     columns = "txyp"
     counted = "line"
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
-        """`size` is the image's width and height, which a header is compared with."""
+        """`size` is the image's width and height; a header must agree with it."""
         self.path = path
         self.name = str(path)
         self._size = size
@@ -49,7 +49,7 @@ class TextRows:
     def blocks(self) -> Iterator[RowBlock]:
         self.notes = []
         read, number, is_first = 0, 1, True
-        # Latin-1 reads any bytes; line ends of all systems become one.
+        # Latin-1 decodes any bytes; universal newlines accept the line ends of all systems.
         with self.path.open(encoding="latin-1") as file:
             while text := file.read(CHUNK):
                 text += file.readline(LONGEST_LINE)
@@ -78,7 +78,7 @@ class TextRows:
         return text.removeprefix("\xef\xbb\xbf")
 
     def _line_by_line(self, text: str, first: int, is_start: bool) -> RowBlock:
-        """Return the rows of a text where some lines are no events; `is_start`: none came before."""
+        """Return the rows of a text with some lines that are no events; `is_start`: the file starts here."""
         lines = text.translate(SEPARATORS).split("\n")
         kept = [(first + k, line) for k, line in enumerate(lines) if line.strip() and line.lstrip()[0] != "#"]
         if is_start and kept and self._is_header(*kept[0]):
@@ -121,7 +121,7 @@ class TextRows:
 
 
 def _numbers(text: str) -> np.ndarray | None:  # [N, 4] float64
-    """Return the numbers of lines without comments, None where some line does not hold four."""
+    """Return the numbers of lines without comments; None: a line does not hold four numbers."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # no lines

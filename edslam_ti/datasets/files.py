@@ -1,4 +1,4 @@
-"""Reading the small files around an event stream: lists of times, images, numbered names."""
+"""Reads the small files of a recording: lists of times, images, numbered names."""
 
 import os
 import re
@@ -28,7 +28,7 @@ def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, colu
 def read_timed_paths(path: Path, use: str = "seconds") -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
     """Return the times and files of a list of lines 't path'; paths start at the list's folder.
 
-    `use` says in a message what the lines are for.
+    `use` states the purpose of the lines in messages.
     """
     times: list[float] = []
     files: list[Path] = []
@@ -68,7 +68,7 @@ def read_timestamps(path: Path, files: dict[int, Path]) -> np.ndarray:  # [I] s
             number = int(name[0][:20])  # 000012 for 12
         if number in times:
             raise DataError(f"{path}: line {line}: a second time for {plain(name[0], 60)}; keep one")
-        if number is not None:  # lines may tell of images that are not there
+        if number is not None:  # lines may name images that do not exist
             times[number] = time
     missing = [f.name for number, f in files.items() if number not in times]
     if missing:
@@ -109,7 +109,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def first_image_size(paths: list[Path]) -> tuple[int, int]:
-    """Return (width, height) of the first image that can be read; raise what the first raises if none can."""
+    """Return (width, height) of the first readable image; if none is, raise the first one's error."""
     problem: DataError | OSError | None = None
     for path in paths:
         try:
@@ -120,10 +120,10 @@ def first_image_size(paths: list[Path]) -> tuple[int, int]:
 
 
 def decode(path: Path, flags: int, camera: Camera | None = None, what: str = "image") -> np.ndarray:
-    """Return the pixels of an image file as OpenCV decodes them, of the size of `camera` if it is given.
+    """Return the pixels of an image file as OpenCV decodes them; check the size against `camera` if given.
 
-    Bytes are read here, because OpenCV takes only names in UTF-8. What a PNG says of its size is compared
-    first: a few bytes may promise gigabytes.
+    Bytes are read here, because OpenCV accepts only names in UTF-8. The size in a PNG's header is checked
+    first: a few bytes may claim gigabytes.
     """
     data = file_bytes(path, what)
     if data[:8] == PNG_SIGNATURE and len(data) >= 24:
@@ -155,7 +155,7 @@ def check_size(path: Path, shape: tuple[int, ...], camera: Camera | None, what: 
 
 
 def file_bytes(path: Path, what: str) -> bytes:
-    """Return what is in a file of at most `LARGEST_IMAGE` bytes; devices and pipes are no files."""
+    """Return the contents of a file of at most `LARGEST_IMAGE` bytes; refuse devices and pipes."""
     if not path.is_file():
         raise FileNotFoundError(plain(f"{path}: {what} not found", LONGEST_MESSAGE))
     try:
@@ -171,7 +171,7 @@ _stderr_lock = threading.Lock()
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep off stderr what C libraries print of a damaged file; the error that is raised says it."""
+    """Suppress what C libraries print on stderr about a damaged file; the raised error reports it."""
     with _stderr_lock:
         try:
             saved = os.dup(STDERR)

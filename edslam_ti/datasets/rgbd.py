@@ -19,11 +19,11 @@ Replica as NICE-SLAM rendered it (Zhu et al. 2022):
 
 Poses and images are optional, depth is not. A `camera.json` (camera_file.py) may state the camera (all of
 width, height, fx, fy, cx, cy; pixel centres at integers unless it says "half"), `depth_scale`, `invalid` and
-`frame_rate` (default 30 Hz, where files have numbers and no times).
+`frame_rate` (default 30 Hz, if files have numbers and no times).
 
-TUM states no camera in its folders: `freiburg1`, 2 or 3 in the folder's name gives the published one, and
-images and depth are undistorted with it. Its depth and colour are not taken at the same moment: each depth
-image gets the nearest colour image within `MAX_DIFFERENCE`, each colour image serves once, and counts as
+TUM's folders do not state the camera. `freiburg1`, 2 or 3 in the folder's name selects the published one, and
+images and depth are undistorted with it. TUM's depth and colour are not taken at the same time. Each depth
+image gets the nearest colour image within `MAX_DIFFERENCE`; each colour image is used once, and counts as
 taken at the time of the depth.
 """
 
@@ -56,7 +56,7 @@ from edslam_ti.trajectory import Trajectory, read_tum
 MAX_DIFFERENCE = 0.02  # s between depth and its colour image (associate.py of the TUM benchmark)
 TUM_SCALE, MILLIMETRES = 5000.0, 1000.0  # PNG units in a metre
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
-# Of the TUM benchmark's page: fx, fy, cx, cy of 640x480 pixels, then distortion k1, k2, p1, p2, k3.
+# From the TUM benchmark's page: fx, fy, cx, cy for 640x480 pixels, then distortion k1, k2, p1, p2, k3.
 FREIBURG = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -66,7 +66,7 @@ FREIBURG = {
 
 @dataclass(frozen=True)
 class _Recording:
-    """What a layout's files say."""
+    """Contents of a layout's files."""
 
     camera: Camera
     depth_format: DepthFormat
@@ -75,7 +75,7 @@ class _Recording:
     image_files: list[Path]
     image_times: np.ndarray  # [I] s, strictly increasing
     truth: Trajectory | None
-    notes: tuple[str, ...] = ()  # what was mended in the files
+    notes: tuple[str, ...] = ()  # repairs of the files
     distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 of images and depth; none: undistorted
 
 
@@ -108,7 +108,7 @@ class RgbdSequence(EventDepthSequence):
             self.truth = Trajectory(recording.truth.timestamps - self.time_offset, recording.truth.poses)
             check_clock(self, folder, "the file of poses", self.truth.timestamps)
         self._maps = _undistortion(self.camera, recording.distortion)
-        look_at_images(self, folder)  # what is wrong shows now, not in the middle of a run
+        look_at_images(self, folder)  # find faults now, not in the middle of a run
 
     @property
     def time_range(self) -> tuple[float, float]:
@@ -186,7 +186,7 @@ def associated(
     second: np.ndarray,  # [B] s, increasing
     max_difference: float,  # s
 ) -> dict[int, int]:
-    """Return the partner in `second` of each time in `first` that has one, nearest pairs first.
+    """Return the index in `second` for each time in `first` that has a partner; nearest pairs match first.
 
     No time is used twice (associate.py of the TUM benchmark).
     """
@@ -202,7 +202,7 @@ def associated(
 
 
 def _freiburg_camera(folder: Path) -> tuple[Camera, tuple[float, ...]]:
-    """Return the published camera of a TUM sequence, known by its name, and its distortion."""
+    """Return the published camera of a TUM sequence, identified by its name, and its distortion."""
     name = re.search(r"f(?:reiburg|r)([123])(?!\d)", folder.resolve().name)
     if name is None:
         raise DataError(
@@ -248,7 +248,7 @@ def _read_replica(folder: Path) -> _Recording:
 
 
 def _replica_camera(folder: Path) -> tuple[Camera, float]:
-    """Return the camera of cam_params.json and the depth PNG units in a metre."""
+    """Return the camera of cam_params.json and the depth PNG units per metre."""
     places = [parent / "cam_params.json" for parent in (folder, folder.resolve().parent)]
     path = next((p for p in places if p.is_file()), None)
     if path is None:
@@ -301,7 +301,7 @@ def _read_frames(folder: Path) -> _Recording:
 
 
 def _matrix_camera(folder: Path, images: list[Path]) -> Camera:
-    """Return the camera of camera-intrinsics.txt, of the size of the images."""
+    """Return the camera of camera-intrinsics.txt, with the size of the images."""
     places = [parent / "camera-intrinsics.txt" for parent in (folder, folder.resolve().parent)]
     path = next((p for p in places if p.is_file()), None)
     if path is None:
@@ -323,7 +323,7 @@ def _matrix_camera(folder: Path, images: list[Path]) -> Camera:
 
 
 def _stated_camera(folder: Path, stated: CameraFile) -> Camera | None:
-    """Return the camera that camera.json states, None where it says nothing of it."""
+    """Return the camera that camera.json states; None: it states none."""
     missing = [name for name in INTRINSICS if name not in stated.model_fields_set]
     if len(missing) == len(INTRINSICS):
         return None
@@ -335,7 +335,7 @@ def _stated_camera(folder: Path, stated: CameraFile) -> Camera | None:
 
 
 def _numbered(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the files of a pattern by their number; there need not be any."""
+    """Return the files of a pattern by their number; empty if there are none."""
     return numbered_files(folder, pattern, suffixes) if any(folder.glob(pattern)) else {}
 
 
@@ -358,9 +358,9 @@ def _poses(path: Path) -> np.ndarray:  # [F, 4, 4]
 
 @dataclass(frozen=True)
 class _Layout:
-    """How depth images and what belongs to them are arranged in a folder."""
+    """An arrangement of depth images and related files in a folder."""
 
-    files: str  # what tells it, for messages
+    files: str  # its distinctive files, for messages
     detect: Callable[[Path], bool]
     read: Callable[[Path], _Recording]
 

@@ -7,15 +7,15 @@
     depth/*.png or derived_depth/*.png                   16 bits; the number in the name is the line (from 0)
                                                          of images.txt that holds its time
 
-The dataset itself has no depth. Depth images are expected undistorted, pixel for pixel in the camera of
-this loader (K of calib.txt, no distortion), in 1/5000 m as in TUM RGB-D; a `camera.json` {"depth_scale": S}
-states another unit. Found on slider_depth by warping images with its `derived_depth` (plane sweep, not
-sensor data) between the true poses: 1/5000 m fits (half and double are four times worse), undistorted fits
-better than distorted, and the poses are camera-to-world in OpenCV axes (x to the right).
+The dataset itself has no depth. Depth images must be undistorted, pixel for pixel in the camera of this
+loader (K of calib.txt, no distortion), in 1/5000 m as in TUM RGB-D; a `camera.json` {"depth_scale": S} states
+another unit. These conventions were checked on slider_depth by warping images with its `derived_depth` (plane
+sweep, not sensor data) between the true poses: 1/5000 m fits (half and double are four times worse),
+undistorted fits better than distorted, and the poses are camera-to-world in OpenCV axes (x to the right).
 
-Events and images are undistorted here. Every undistorted pixel takes the events of the sensor's pixel nearest
-to where it is seen, so that none stays without events and none counts those of two: an event may come twice,
-or is dropped.
+Events and images are undistorted here. Every undistorted pixel takes the events of the sensor pixel nearest
+to its distorted position. So no pixel is left without events and none gets those of two sensor pixels, but an
+event may be duplicated or dropped.
 """
 
 from pathlib import Path
@@ -40,10 +40,10 @@ from edslam_ti.errors import DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory, read_tum
 
-EVENTS_AT_ONCE = 1_000_000  # undistorting takes some 70 bytes an event, its result 13
-TUM_DEPTH_SCALE = 5000.0  # PNG units in a metre
+EVENTS_AT_ONCE = 1_000_000  # undistorting takes some 70 bytes per event, its result 13
+TUM_DEPTH_SCALE = 5000.0  # PNG units per metre
 LARGEST_DISTORTION = 1000  # coefficients of real lenses are below 10
-LEAST_SEEN = 0.1  # share of the undistorted image
+LEAST_SEEN = 0.1  # share of the undistorted image that the sensor must see
 
 
 class RpgSequence(EventDepthSequence):
@@ -115,10 +115,10 @@ class RpgSequence(EventDepthSequence):
 
 
 class _EventUndistortion:
-    """Nearest-neighbour remapping of an image, for the events that make it up.
+    """Nearest-neighbour remapping of events, from each undistorted pixel to its sensor pixel.
 
-    Taking every event to the nearest undistorted pixel instead leaves curves of pixels without any, and
-    others with those of two pixels, whose brightness seems to change twice as much.
+    Moving every event to the nearest undistorted pixel instead would leave curves of pixels without events,
+    and give others the events of two pixels, so that their brightness seems to change twice as much.
     """
 
     def __init__(
@@ -134,10 +134,10 @@ class _EventUndistortion:
         order = np.argsort(source, kind="stable")
         self._targets = order[is_seen[order]]  # undistorted pixels, sorted by the sensor's pixel
         number = np.bincount(source[is_seen], minlength=height * self._width)
-        self._first = np.append(0, np.cumsum(number))  # [H W + 1] of a sensor pixel's among the targets
+        self._first = np.append(0, np.cumsum(number))  # [H W + 1] first target of each sensor pixel
 
     def __call__(self, events: Events) -> Events:
-        """Return the events as an undistorted camera had sent them, in the same order."""
+        """Return the events as an undistorted camera would have sent them, in the same order."""
         return Events.concatenate([self._undistorted(piece) for piece in events.pieces(EVENTS_AT_ONCE)])
 
     def _undistorted(self, events: Events) -> Events:

@@ -1,4 +1,4 @@
-"""True poses as other conventions read them: which of them an estimate agrees with."""
+"""Reads true poses under other conventions, to find the one that an estimate agrees with."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from edslam_ti.evaluation.trajectories import align, align_views
 from edslam_ti.geometry import inverse
 
-EXPLAINED = 1 / 3  # share of the views' distance that is left, if another reading explains it
-BETTER = 0.9  # share left by a reading that is to be preferred to one before it, which is more usual
-ROUNDS = 4  # of aligning the paths and fitting the axes by turns
+EXPLAINED = 1 / 3  # a reading explains the error if at most this share of the views' distance remains
+BETTER = 0.9  # a reading must leave less than this share of what an earlier, more usual one leaves
+ROUNDS = 4  # of alternately aligning the paths and fitting the axes
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # its cameras look along -z, with y up
 
@@ -20,7 +20,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # its cameras look along -z, with y up
 class Reading:
     """Another way to read true poses."""
 
-    looks: str  # what the poses look like, in words
+    looks: str  # how messages describe such poses
     read: Callable[[np.ndarray], np.ndarray]  # [P, 4, 4] -> [P, 4, 4]
     is_inverted: bool = False
 
@@ -43,7 +43,7 @@ def better_reading(
     true: np.ndarray,  # [P, 4, 4]
     size: float,  # m, distance to what the cameras see
 ) -> Reading | None:
-    """Return the reading of the true poses that the estimate agrees with, None if none is clearly better."""
+    """Return the reading of the true poses that the estimate agrees with; None: none is clearly better."""
     axes = _other_axes(estimated, true, size)
     angle = np.degrees(Rotation.from_matrix(axes[:3, :3]).magnitude())
     other = Reading(
@@ -59,7 +59,7 @@ def better_reading(
 
 
 def apart(estimated: np.ndarray, true: np.ndarray, size: float) -> float:  # [P, 4, 4] each, m -> m
-    """Return how far apart, after alignment, is what two paths see at a distance of `size` (rms)."""
+    """Return the rms distance, after alignment, between points that two paths see at distance `size`."""
     moved = align_views(estimated, true, size) @ estimated
     squared = ((moved[:, :3, 3] - true[:, :3, 3]) ** 2).sum(1)
     squared += 0.5 * size**2 * ((moved[:, :3, :3] - true[:, :3, :3]) ** 2).sum((1, 2))  # a turn's square
@@ -98,9 +98,10 @@ def _turned(poses: np.ndarray, R: np.ndarray) -> np.ndarray:  # [P, 4, 4], [P, 3
 
 
 def _other_axes(estimated: np.ndarray, true: np.ndarray, size: float) -> np.ndarray:  # [4, 4]
-    """Return the turn of the truth's frame against the camera under which the views fit best.
+    """Return the rotation between the truth's frame and the camera under which the views fit best.
 
-    By turns the paths are aligned and the turn is fitted, from every rotation that exchanges axes on.
+    The paths are aligned and the rotation is fitted alternately, starting from every rotation that exchanges
+    axes.
     """
     best, least = np.eye(4), np.inf
     for R in Rotation.create_group("O").as_matrix():

@@ -1,7 +1,7 @@
 """PSNR, SSIM, LPIPS and depth L1 of rendered views against the truth.
 
-Peers call different things PSNR, so every variant has a name of its own: raw images or EventNeRF's linear
-fit; pixels with true depth, or all.
+Publications use the name PSNR for different measures, so every variant has its own name here: raw images or
+EventNeRF's linear fit; pixels with true depth, or all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation.lpips import ImageDistance, load_lpips
 
-# Lists hold one array per view. A mask says which pixels count; images of one set share one fit.
+# Lists hold one array per view. A mask selects the pixels that count; images of one set share one fit.
 
 Images = Sequence[np.ndarray]  # V of [H, W] or [H, W, C], brightness in gamma space, [0, 1]
 Masks = Sequence[np.ndarray]  # V of [H, W] bool
@@ -36,11 +36,11 @@ class LinearFit:
 
 
 def fit_event_nerf(predictions: Images, truths: Images, masks: Masks) -> LinearFit:
-    """Return EventNeRF's colour correction: events fix brightness only up to a slope and an offset in log.
+    """Return EventNeRF's colour correction: events determine log brightness only up to slope and offset.
 
     Least squares in closed form over the pixels in the masks of all views (EventNeRF, metric/main.py):
     slope = covariance / variance of the prediction, offset = mean(truth) - slope * mean(prediction). The
-    renders are taken as they are, without rounding to 8 bits.
+    renders are not rounded to 8 bits.
     """
     x = np.concatenate([_log_brightness(p)[m] for p, m in zip(predictions, masks)])  # [P, C]
     y = np.concatenate([_log_brightness(t)[m] for t, m in zip(truths, masks)])
@@ -48,7 +48,7 @@ def fit_event_nerf(predictions: Images, truths: Images, masks: Masks) -> LinearF
         raise DataError("image metrics: no pixel to compare; expected true depth in at least one view")
     variance = x.var(0)
     covariance = ((x - x.mean(0)) * (y - y.mean(0))).mean(0)
-    flat = variance < 1e-12  # an image of one brightness: only the offset can be fitted
+    flat = variance < 1e-12  # with uniform brightness only the offset can be fitted
     slope = np.where(flat, 1.0, covariance / np.where(flat, 1.0, variance))
     return LinearFit(slope, y.mean(0) - slope * x.mean(0))
 
@@ -86,7 +86,7 @@ def ssim(predictions: Images, truths: Images, masks: Masks) -> float:
 def depth_l1_cm(rendered: Images, true: Images) -> float | None:
     """Return the mean absolute depth error over the pixels with true depth, centimetres.
 
-    A pixel where nothing is rendered counts with its whole depth. None: no true depth at all.
+    A pixel where nothing is rendered counts with its full depth. None: there is no true depth.
     """
     errors = np.concatenate([np.abs(r - t)[t > 0].astype(np.float64) for r, t in zip(rendered, true)])
     return 100 * float(errors.mean()) if len(errors) else None
@@ -105,7 +105,7 @@ class ViewMetrics:
 class ImageMetrics:
     """Metrics of a set of views: over pixels with true depth (the headline), and over all pixels.
 
-    `corrected` is after EventNeRF's fit over the same pixels. LPIPS knows no mask: for the headline, pixels
+    `corrected`: after EventNeRF's fit over the same pixels. LPIPS has no mask: for the headline, pixels
     without true depth are filled with the truth.
     """
 
@@ -184,7 +184,7 @@ def _view_metrics(
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """Return the mean of what there is."""
+    """Return the mean of the values that are not None."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 

@@ -18,15 +18,15 @@ from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import true_poses_at
 
 NUM_SAMPLES = 100_000  # points drawn on a reconstructed mesh
-SPACING = 0.02  # metres; one true point is kept of those that fall into a cube of this size
+SPACING = 0.02  # metres; one true point is kept per cube of this size
 COMPLETE_WITHIN = 0.05  # metres
-OCCLUSION = 0.03  # metres, or this share of the depth, by which a surface may lie behind what is in front
-VIEW_STEP, VIEW_TURN = 0.1, 5.0  # metres, degrees between the views that say what was seen
+OCCLUSION = 0.03  # metres, or share of the depth: a point farther behind the visible surface is occluded
+VIEW_STEP, VIEW_TURN = 0.1, 5.0  # metres, degrees between the views that determine which surfaces were seen
 
 
 @dataclass(frozen=True)
 class SurfaceErrors:
-    """How far two surfaces are apart."""
+    """Distances between a mesh and the true surfaces."""
 
     accuracy_cm: float  # mean distance of the mesh from the true surfaces
     completion_cm: float  # mean distance of the true points that a camera saw from the mesh
@@ -54,7 +54,7 @@ class TrueSurfaces:
         return self._caster.cast(pixel_rays(camera, T_world_camera)).depth
 
     def views(self, camera: Camera, poses: Iterable[np.ndarray]) -> list[DepthView]:
-        """Return what cameras at these poses [4, 4] see, at half the size."""
+        """Return the depth that cameras at these poses [4, 4] see, at half the size."""
         small = camera.downscaled(2)
         return [DepthView(small, T, self.depth(small, T)) for T in poses]
 
@@ -65,7 +65,7 @@ class TrueSurfaces:
         T_world_estimate: np.ndarray,  # [4, 4], from the mesh's frame to that of the surfaces
         seed: int = 0,
     ) -> SurfaceErrors:
-        """Compare a mesh with the surfaces; raise DataError where the mesh or `seen` is empty."""
+        """Compare a mesh with the surfaces; raise DataError if the mesh or `seen` is empty."""
         if len(mesh.triangles) == 0 or len(seen) == 0:
             raise DataError(
                 f"mesh errors: expected triangles and points that a camera saw, got {len(mesh.triangles)} "
@@ -85,9 +85,9 @@ class TrueSurfaces:
 
 
 def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -> SurfaceErrors:
-    """Compare a mesh in the frame of an estimated path with what the sequence's camera saw on the way.
+    """Compare a mesh in the frame of an estimated path with the surfaces that the sequence's camera saw.
 
-    A surface counts as seen if it lies in a view of the true path at the estimate's times, or in a novel one.
+    A surface counts as seen if a view from the true path at the estimate's times shows it, or a novel view.
     """
     if sequence.surfaces_file is None or sequence.truth is None:
         raise DataError(
@@ -106,7 +106,7 @@ def mesh_errors(mesh: Any, sequence: EventDepthSequence, estimate: Trajectory) -
 
 
 def seen_points(views: Iterable[DepthView]) -> np.ndarray:  # [N, 3] float32 metres, world
-    """Return points evenly spread over all that was seen."""
+    """Return evenly distributed points on all surfaces that were seen."""
     parts = [np.empty((0, 3), np.float32)]
     parts += [_world_points(v.depth, v.camera, v.T_world_camera).astype(np.float32) for v in views]
     points = np.concatenate(parts)
@@ -120,14 +120,14 @@ def seen_pixels(
     T_world_camera: np.ndarray,  # [4, 4] of that view
     views: Iterable[DepthView],
 ) -> np.ndarray:  # [H, W] bool
-    """Return the pixels of a view whose surface is visible in one of the views, too."""
+    """Return the pixels of a view whose surface is also visible in one of the views."""
     points = _world_points(depth, camera, T_world_camera)
     seen = np.zeros(len(points), bool)
 
     def distance(view: DepthView) -> float:
         return float(np.linalg.norm(view.T_world_camera - T_world_camera))
 
-    for view in sorted(views, key=distance):  # the nearest see most: little is left for the others
+    for view in sorted(views, key=distance):  # the nearest see most, so few pixels remain for the others
         left = np.flatnonzero(~seen)
         if len(left) == 0:
             break

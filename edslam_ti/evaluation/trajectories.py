@@ -1,7 +1,7 @@
-"""Errors of an estimated path against the true one, through evo, and the alignments that they rest on.
+"""Errors of an estimated path against the true one, computed by evo, and the alignments that they need.
 
-Peers call different things ATE, so every variant has a name of its own: SE(3) or Sim(3) alignment; rmse,
-mean, median or maximum.
+Publications use the name ATE for different measures, so every variant has its own name here: SE(3) or Sim(3)
+alignment; rmse, mean, median or maximum.
 """
 
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from edslam_ti.geometry import orthonormalized
 from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import FARTHEST, true_path, true_poses_at
 
-FEWEST_POSES = 3  # that an alignment needs
-UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}  # of time stamps, in a second
-ACROSS_A_HOLE = 1.5  # times the usual step between the poses compared
+FEWEST_POSES = 3  # needed for an alignment
+UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}  # of time stamps, per second
+ACROSS_A_HOLE = 1.5  # a step longer than this many usual steps between compared poses crosses a hole
 
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Errors of an estimated path against the truth at its own times, where `true_poses_at` knows it.
+    """Errors of an estimated path at its own times, where `true_poses_at` knows the truth.
 
     ATE: distance of positions after Umeyama alignment of all poses, with rotation and translation (SE(3)) or
-    scale too (Sim(3)). RPE: error of the motion between consecutive poses, of the path without scaling; pairs
-    with a hole of the truth between them are left out.
+    also scale (Sim(3)). RPE: error of the motion between consecutive poses of the unscaled path; pairs with a
+    hole of the truth between them are left out.
     """
 
     timestamps: np.ndarray  # [P] s, the poses compared
-    indices: np.ndarray  # [P] of the poses compared in the estimate
+    indices: np.ndarray  # [P] indices of the compared poses in the estimate
     T_truth_estimate: np.ndarray  # [4, 4] SE(3) alignment
     aligned_positions: np.ndarray  # [P, 3] m, estimate in the truth's frame, SE(3)
     true_positions: np.ndarray  # [P, 3] m
@@ -80,9 +80,9 @@ class TrajectoryErrors:
 
 
 def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
-    """Compare the poses of an estimate at whose times the truth is known with the truth there.
+    """Compare an estimate with the truth, at the poses whose times the truth covers.
 
-    Raises `DataError` with one line when there are fewer than three, or positions that are no metres.
+    Raises `DataError` if there are fewer than three such poses, or positions are not in metres.
     """
     from evo.core.metrics import APE, RPE, PoseRelation
     from evo.core.trajectory import PosePath3D
@@ -148,8 +148,9 @@ def align(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return R [3, 3], t [3], s that bring the estimated positions closest to the true ones: s R p + t.
 
-    Umeyama 1991 through evo. Positions on a line (a slider) or at one point leave R free, which evo refuses:
-    among the rotations that fit the positions equally well, the one that fits the orientations is taken.
+    Umeyama 1991, computed by evo. Positions on a line (a slider) or at one point do not determine R, and evo
+    refuses them. Then, among the rotations that fit the positions equally well, the one that best fits the
+    orientations is returned.
     """
     from evo.core.geometry import GeometryException, umeyama_alignment
 
@@ -176,11 +177,11 @@ def align_views(
     true: np.ndarray,  # [P, 4, 4]
     distance: float = 1.0,  # metres to what the cameras see
 ) -> np.ndarray:  # [4, 4]
-    """Return the rigid motion from the estimate's frame to the truth's under which the cameras see alike.
+    """Return the rigid motion from the estimate's frame to the truth's under which the cameras' views agree.
 
-    Positions alone leave the rotation loose where the path is short: 1 mm over 10 cm is half a degree,
-    two pixels. Here the points `distance` metres along the axes of every camera are brought together, too:
-    Procrustes with the orientations added to the covariance of the positions.
+    If the path is short, positions alone determine the rotation poorly: 1 mm over 10 cm is half a degree, two
+    pixels. Therefore the points `distance` metres along the axes of every camera are aligned, too: Procrustes
+    with the orientations added to the covariance of the positions.
     """
     p, q = estimated[:, :3, 3], true[:, :3, 3]
     covariance = (q - q.mean(0)).T @ (p - p.mean(0))
@@ -206,7 +207,7 @@ def statistics(errors: np.ndarray) -> dict[str, float]:
 
 
 def _check_positions(estimate: Trajectory, truth: Trajectory) -> None:
-    """Refuse positions that are no metres; of the truth, a few such poses are left out instead."""
+    """Refuse positions that are not in metres; a few such poses of the truth are left out instead."""
     for name, path, allowed in (("estimate", estimate, 0.0), ("truth", truth, 0.5)):
         far = ~(np.abs(path.poses[:, :3, 3]) <= FARTHEST).all(1)
         if far.sum() > allowed * len(path):
@@ -219,7 +220,7 @@ def _check_positions(estimate: Trajectory, truth: Trajectory) -> None:
 
 
 def _too_few(estimate: Trajectory, truth: Trajectory, num_common: int) -> str:
-    """Return the line that says why two paths cannot be compared."""
+    """Return a message that says why two paths cannot be compared."""
     times, stamps = estimate.timestamps, truth.timestamps
     line = (
         f"trajectory: expected at least {FEWEST_POSES} poses at times that the truth covers, got "
@@ -233,7 +234,7 @@ def _too_few(estimate: Trajectory, truth: Trajectory, num_common: int) -> str:
             ratio = np.ptp(odd) / factor / np.ptp(other)
             meets = odd[0] / factor <= other[-1] and odd[-1] / factor >= other[0]
             if 0.1 < ratio < 30 and (meets or 0.7 < ratio < 1.5):
-                return f"{line} The {name} looks as if in {unit}"
+                return f"{line} The {name} looks as if it were in {unit}"
     if stamps[0] > times[-1] or times[0] > stamps[-1]:
         return f"{line} They begin {abs(stamps[0] - times[0]):.9g} s apart"
     inside = int(((stamps >= times[0]) & (stamps <= times[-1])).sum())
@@ -249,7 +250,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-# Slices of EventReplica's scenes that IncEventGS evaluates on, as (first, end) of every second written pose
+# Slices of EventReplica's scenes on which IncEventGS evaluates, as (first, end) of every second written pose
 # (configs/SimuEvent/replica_*.yaml of WU-CVGL/IncEventGS at 28d070f).
 INCEVENTGS_SLICES = {
     "office0": (10, 60),
@@ -263,11 +264,11 @@ INCEVENTGS_SLICES = {
 def inceventgs_slice(
     scene: str, truth: Trajectory, estimate: Trajectory
 ) -> tuple[float, float] | None:  # seconds
-    """Return IncEventGS's slice of one of EventReplica's scenes; None: the estimate does not cover it."""
+    """Return IncEventGS's slice of an EventReplica scene; None: the estimate does not cover it."""
     first, end = (2 * k for k in INCEVENTGS_SLICES.get(scene, (0, 0)))
     if end == 0 or end >= len(truth):
         return None
     start, stop = float(truth.timestamps[first]), float(truth.timestamps[end])
-    tolerance = 0.1  # seconds; the first sample comes a little after the first event
+    tolerance = 0.1  # seconds; the first sample is a little later than the first event
     covered = estimate.timestamps[0] <= start + tolerance and estimate.timestamps[-1] >= stop - tolerance
     return (start, stop) if covered else None

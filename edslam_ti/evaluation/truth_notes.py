@@ -1,6 +1,6 @@
-"""What a truth looks like beside an estimate: one line for each thing about it that looks wrong.
+"""Checks a truth against an estimate, and writes one line for each likely fault of the truth.
 
-Nothing is applied here: a line names what would explain an error, and how small the error would be then.
+It corrects nothing: a line names a possible cause of an error, and the error that would remain without it.
 """
 
 import numpy as np
@@ -10,17 +10,17 @@ from edslam_ti.evaluation.trajectories import TrajectoryErrors
 from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import TruePath, true_path
 
-FEW_POSES = 10  # compared; alignment alone fits six numbers to them
-MOST_POSES = 400  # that are looked at, evenly spread: what is wrong is wrong all along
+FEW_POSES = 10  # a note is made below this number of compared poses; alignment alone fits six numbers to them
+MOST_POSES = 400  # evenly spaced poses that are checked; a fault concerns all of them
 FULL_COVERAGE = 0.95  # share of frames: the last ones may come after the truth's end
 
-SCALE_DIFFERS = 0.005  # least, beside three times what errors leave uncertain
-CLEARLY_BETTER = 0.5  # share of an error that is left, if something explains it
+SCALE_DIFFERS = 0.005  # smallest difference of scale, besides three times its uncertainty
+CLEARLY_BETTER = 0.5  # a cause explains an error if at most this share of it remains
 HIGH_RPE = 5.0  # times the ATE; errors of positions alone give at most 2
-SMALL_ATE, SMALL_RPE = 1e-3, 0.05  # cm: their ratio means nothing below
-SMALL_ERROR = 0.01  # cm of the truth's interpolation that never matters
-APART = 0.05  # share of the distance to what is seen by which views are apart, if orientations are wrong
-LONGEST_SHIFT = 0.25  # s between two clocks that is looked for
+SMALL_ATE, SMALL_RPE = 1e-3, 0.05  # cm: below these their ratio means nothing
+SMALL_ERROR = 0.01  # cm; a smaller interpolation error of the truth never matters
+APART = 0.05  # orientations are wrong if views differ by this share of the distance to the visible surfaces
+LONGEST_SHIFT = 0.25  # s; shifts between two clocks are searched up to this
 SHORTEST_SHIFT = 0.002  # s
 NUM_SHIFTS = 101
 
@@ -28,9 +28,9 @@ NUM_SHIFTS = 101
 def truth_notes(
     estimate: Trajectory, truth: Trajectory, errors: TrajectoryErrors, time_offset: float = 0.0
 ) -> list[str]:
-    """Return what looks wrong with a truth, a line each; times are printed `time_offset` seconds later.
+    """Return one line for each likely fault of a truth; times are printed `time_offset` seconds later.
 
-    `errors` are those that `trajectory_errors` returns for the two.
+    `errors` is the result of `trajectory_errors` for the two.
     """
     path = true_path(truth)
     notes = [*_jumps(path, time_offset), *_holes(estimate, errors, path, time_offset)]
@@ -44,7 +44,7 @@ def truth_notes(
     return notes + orientations
 
 
-# --- what there is of it ---
+# --- coverage ---
 
 
 def _jumps(path: TruePath, time_offset: float) -> list[str]:
@@ -76,13 +76,13 @@ def _few(errors: TrajectoryErrors) -> list[str]:
     if errors.num_poses >= FEW_POSES:
         return []
     return [
-        f"only {errors.num_poses} of {errors.num_estimated} poses are compared with the truth: the errors of "
-        "so few say little"
+        f"only {errors.num_poses} of {errors.num_estimated} poses are compared with the truth: too few "
+        "for reliable errors"
     ]
 
 
 def _slow(errors: TrajectoryErrors, path: TruePath) -> list[str]:
-    """Say when the truth is interpolated over steps as long as its errors are small."""
+    """Return a line if the truth's stamps are too sparse for errors this small."""
     times = errors.timestamps
     k = np.clip(np.searchsorted(path.stamps, times), 1, len(path.stamps) - 1)
     from_stamp = np.minimum(np.abs(times - path.stamps[k - 1]), np.abs(times - path.stamps[k]))
@@ -92,15 +92,15 @@ def _slow(errors: TrajectoryErrors, path: TruePath) -> list[str]:
         return []
     return [
         f"truth comes every {1000 * path.median_step:.3g} ms: half way between, its interpolation is off by "
-        f"about {own:.2g} cm, which is not small beside the ATE of {errors.ate_rmse_cm:.2g} cm"
+        f"about {own:.2g} cm, which is not small compared with the ATE of {errors.ate_rmse_cm:.2g} cm"
     ]
 
 
-# --- what explains its errors ---
+# --- causes of errors ---
 
 
 def _scaling(errors: TrajectoryErrors) -> list[str]:
-    """Say when a scale that differs from 1 for certain explains most of the error."""
+    """Return a line if a scale that certainly differs from 1 explains most of the error."""
     spread = 100 * _spread_m(errors)
     rigid, scaled = errors.ate_rmse_cm, errors.ate_rmse_sim3_cm
     if errors.scale <= 0 or spread == 0:
@@ -116,7 +116,7 @@ def _scaling(errors: TrajectoryErrors) -> list[str]:
 
 
 def _shifted(estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, with_scale: bool) -> list[str]:
-    """Say when the truth at other times, all shifted alike, fits much better."""
+    """Return a line if the truth with all times shifted equally fits much better."""
     few = slice(None, None, -(-errors.num_poses // MOST_POSES))
     times, estimated = errors.timestamps[few], estimate.poses[errors.indices[few]]
     span = float(np.ptp(times))
@@ -147,7 +147,7 @@ def _shifted(estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, wit
     if abs(shift) < SHORTEST_SHIFT or shifted > CLEARLY_BETTER * as_it_is or as_it_is - shifted < clear:
         return []
     return [
-        f"truth looks {1000 * abs(shift):.0f} ms {'late' if shift > 0 else 'early'}: so shifted, ATE is "
+        f"truth looks {1000 * abs(shift):.0f} ms {'late' if shift > 0 else 'early'}: with this shift ATE is "
         f"{shifted:.2g} instead of {as_it_is:.2g} cm: check the clocks"
     ]
 
@@ -158,7 +158,7 @@ def _shifted(estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, wit
 def _orientations(
     estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, with_scale: bool
 ) -> list[str]:
-    """Say when orientations, or whole poses, fit much better under another convention."""
+    """Return a line if orientations, or whole poses, fit much better under another convention."""
     estimated, true = estimate.poses[errors.indices], path.poses_at(errors.timestamps)[0]
     if with_scale:
         estimated[:, :3, 3] *= errors.scale
@@ -181,7 +181,7 @@ def _orientations(
     so_read = f"ATE {ate_cm(estimated, other):.2g} cm, RPE {cm:.2g} cm, {degrees:.2g} deg"
     if reading.is_inverted:
         start = f"ATE {errors.ate_rmse_cm:.3g} cm, RPE {rpe:.3g} cm, {turn:.2g} deg: poses look inverted"
-    return [f"{start}: the truth's look like {reading.looks}; so read, {so_read}"]
+    return [f"{start}: the truth's look like {reading.looks}; then {so_read}"]
 
 
 def _spread_m(errors: TrajectoryErrors) -> float:

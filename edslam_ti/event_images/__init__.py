@@ -1,1 +1,1 @@
-"""Images of log brightness made of events: accumulated change, solved images, thresholds, sharp frames."""
+"""Log-brightness images from events: accumulated change, solved images, thresholds, sharp frames."""

@@ -1,32 +1,34 @@
-"""How the log brightness of every pixel has changed since a beginning, from events (Eq. 11).
+"""Change of every pixel's log brightness since a start time, measured by events (Eq. 11).
 
-Events are counted once a frame (`Frame.event_counts`). The tracker reads the change up to now
-(`BrightnessChange`), the mapper that up to each of many frames (`ChangeArchive`). They begin at different
-times and learn different things about a frame, hence two sums of the same counts.
+Events are counted once per frame (`Frame.event_counts`). The tracker reads the change up to now
+(`BrightnessChange`), the mapper the change up to each of many frames (`ChangeArchive`). They start at
+different times and treat the last event differently, so each keeps a sum of its own.
 
-An event says that brightness has passed its level, not where it is now: up to one threshold C beyond, in the
-event's direction unless brightness has turned since. How far on average depends on what else is known:
+An event says that brightness has crossed a level. Now it may be up to one threshold C beyond that level, in
+the event's direction unless it has turned since. The constants below are the mean distance beyond the level;
+it depends on what is known of the pixel.
 """
 
 import numpy as np
 
 from edslam_ti.frame import EventCounts
 
-# Thresholds beyond the last event's level, in its direction, of a pixel that is changing now and whose next
-# event is not known: anything from 0 to 1 alike. Without it a moving edge of contrast g per pixel trails by
+# In thresholds, in the direction of the last event, for a pixel that is changing and whose next event is not
+# known: the distance is uniform from 0 to 1. Without this term a moving edge of contrast g per pixel lags by
 # C / 2g pixels, which biases alignment.
 NEWEST_BIAS = 0.5
-# The same in the direction of the last event and of the next one each, where both are known: they add up in a
-# pixel that goes on and cancel in one that turns. Measured on simulated rooms (less than 0.25, because many
-# pixels rest in between); without it, contrast comes out too small.
+# The same once the next event is known, too: this much in the direction of the last event plus this much in
+# that of the next one. The two terms add if the pixel continues and cancel if it turns. Measured on simulated
+# rooms (less than 0.25, because many pixels rest in between); without it contrast is too small.
 BETWEEN_BIAS = 0.2
-# The same on average over all pixels of an image, changing or not, for the regression of contrast.py.
-# Measured: without it a threshold of 0.35 comes out 3 to 6 % too large; estimated with it, 10 % too small.
+# The same as a mean over all pixels of an image, changing or not, for the regression in contrast.py.
+# Measured: without it a threshold of 0.35 is estimated 3 to 6 % too large; with it as a second unknown, 10 %
+# too small.
 AVERAGE_BIAS = 0.25
 
 
 class BrightnessChange:
-    """Log-brightness change of every pixel from the beginning up to the newest event (Eq. 11)."""
+    """Log-brightness change of every pixel from the start up to the newest event (Eq. 11)."""
 
     def __init__(self, shape: tuple[int, int], positive: float, negative: float) -> None:
         """`positive` and `negative` are the sensor's thresholds C+ and C-, in log brightness."""
@@ -35,14 +37,14 @@ class BrightnessChange:
         self._last = np.zeros(shape, np.int8)  # polarity of the last event
 
     def add(self, counts: EventCounts) -> None:
-        """Add events that follow those added before."""
+        """Add events; they must be later than all added before."""
         self._numbers += counts.numbers
-        # Silent pixels keep their last polarity: a product and a sum, far faster than a masked copy.
+        # Silent pixels keep their last polarity; a product and a sum are far faster than a masked copy.
         self._last *= counts.last == 0
         self._last += counts.last
 
     def log_brightness(self) -> np.ndarray:  # [H, W] float32
-        """Return the change since the beginning."""
+        """Return the change since the start."""
         positive, negative = self._thresholds
         beyond = np.float32(NEWEST_BIAS)
         fell = self._numbers[..., 0].astype(np.float32) + beyond * (self._last < 0)
@@ -50,14 +52,14 @@ class BrightnessChange:
         return positive * rose - negative * fell
 
     def reset(self) -> None:
-        """Begin anew: nothing has changed yet."""
+        """Start again with no change."""
         self._numbers[:], self._last[:] = 0, 0
 
 
 class ChangeArchive:
-    """The change of every pixel from a beginning up to each of several frames (Eq. 11).
+    """The change of every pixel from the start up to each of several frames (Eq. 11).
 
-    Images of earlier frames are completed when the next event of a pixel is known.
+    When a pixel's next event arrives, the images of earlier frames are corrected.
     """
 
     STEPS = 50  # units of the stored images in one threshold
@@ -65,14 +67,14 @@ class ChangeArchive:
     def __init__(
         self,
         shape: tuple[int, int],
-        positive: float = 1.0,  # what an event of either polarity stands for, in (mean) thresholds
+        positive: float = 1.0,  # change per event of each polarity, in (mean) thresholds
         negative: float = 1.0,
     ) -> None:
-        # Units an event; not rounded, because sums grow
+        # Units per event; not rounded, because rounding errors would accumulate
         self._positive, self._negative = self.STEPS * positive, self.STEPS * negative
-        self._level = np.zeros(shape, np.float32)  # units, of events since the beginning
-        self._beyond = np.zeros(shape, np.int16)  # units, that the last event adds
-        self._last_frame = np.zeros(shape, np.int32)  # frames up to this one know their next event
+        self._level = np.zeros(shape, np.float32)  # units, sum of events since the start
+        self._beyond = np.zeros(shape, np.int16)  # units beyond the last event's level
+        self._last_frame = np.zeros(shape, np.int32)  # frame of the pixel's last event
         self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
 
     def __len__(self) -> int:
@@ -84,7 +86,7 @@ class ChangeArchive:
         return list(self._images)
 
     def add(self, counts: EventCounts, index: int, is_kept: bool) -> None:
-        """Add the events up to frame `index`; keep the change up to it, if wanted."""
+        """Add the events up to frame `index`; `is_kept`: keep the change up to it."""
         first, last = counts.first.ravel(), counts.last.ravel()
         fired = np.flatnonzero(first)
         self._add_next_event(fired, self._bias(first[fired]))
@@ -96,12 +98,12 @@ class ChangeArchive:
             self._images[index] = np.rint(self._level).astype(np.int16) + self._beyond
 
     def _bias(self, polarity: np.ndarray) -> np.ndarray:  # [P] -> [P] int16
-        """Return by how many units brightness is beyond an event's level."""
+        """Return how many units brightness is beyond an event's level."""
         worth = np.where(polarity > 0, self._positive, -self._negative)
         return np.rint(BETWEEN_BIAS * worth).astype(np.int16)
 
     def _add_next_event(self, pixels: np.ndarray, bias: np.ndarray) -> None:
-        """Add the bias [P] of pixels' next event to the kept images since their last one, mostly few."""
+        """Add the bias [P] of pixels' next event to the kept images since their last event (mostly few)."""
         last_frame = self._last_frame.ravel()[pixels]
         for frame in reversed(self._images):
             is_waiting = last_frame <= frame
@@ -111,15 +113,15 @@ class ChangeArchive:
             self._images[frame].ravel()[pixels] += bias
 
     def change(self, index: int) -> np.ndarray:  # [H, W] float32
-        """Return the change from the beginning to a kept frame, in contrast thresholds."""
+        """Return the change from the start to a kept frame, in contrast thresholds."""
         return self._images[index].astype(np.float32) / self.STEPS
 
     def drop(self, index: int) -> None:
-        """Give up a frame's image."""
+        """Remove a frame's image."""
         del self._images[index]
 
     def reset(self) -> np.ndarray:  # [H, W] float32
-        """Begin anew here; return what has changed up to here. Kept images stay as they are."""
+        """Make now the start, and return the change since the old one; kept images stay unchanged."""
         change = (self._level + self._beyond).astype(np.float32) / self.STEPS
         self._level[:] = 0
         return change

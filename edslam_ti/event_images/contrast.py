@@ -1,16 +1,16 @@
 """The contrast threshold C of Eq. 11, estimated from grey images where the data states none.
 
-Events alone do not fix it: multiply all log brightness and C by one factor, and the same events come out
-(maps, renders and poses are then right up to that factor, which a fit of slope and offset in log brightness
-takes away). A few grey images do: between two of them, log brightness at every pixel changes by
+Events alone do not determine it: if all log brightness and C are multiplied by one factor, the events are the
+same. (Renders are then right up to that factor, which a fit of slope and offset in log brightness removes.)
+A few grey images determine it: between two of them, log brightness at every pixel changes by
 
     y = C+ p - C- n + error        p, n: positive and negative events in between
 
-Both sides are noisy: p and n by what was left over of the last event and by events of the sensor's own
-making, y by the images' noise. Least squares of y against p, n gives too small a C, of p, n against y too
-large a one. So p and n of the pixels around, whose noise is not this pixel's, stand in as instruments Z
-(Wald 1940): (C+, C-) = (Z^T X)^-1 Z^T y with X = [p, -n]. Without a constant term: a scene as a whole does
-not become brighter, which fixes C+ / C- where a sensor fires by itself.
+Both sides are noisy: p and n because of the remainder since the last event and of noise events, y because of
+image noise. Least squares of y on p, n gives too small a C; of p, n on y, too large a C. The sums of p and n
+over the surrounding pixels have independent noise, so they serve as instruments Z (Wald 1940):
+(C+, C-) = (Z^T X)^-1 Z^T y with X = [p, -n]. There is no constant term: a scene as a whole does not become
+brighter, which determines C+ / C- where a sensor has noise events.
 """
 
 from dataclasses import dataclass
@@ -24,20 +24,20 @@ from edslam_ti.events import Events
 from edslam_ti.frame import EventCounts
 
 DEFAULT = 0.1  # Sec. IV-A: 0.1 synthetic, 0.2 real
-GAPS = (1, 2, 4)  # images between the two of a pair
+GAPS = (1, 2, 4)  # difference of the indices of a pair of images
 MAX_PAIRS = 8  # of each gap
 LONGEST_PAIR = 0.3  # seconds between the two
-DARKEST, BRIGHTEST = 0.1, 0.98  # grey values that are neither lost in 8 bits nor clipped
+DARKEST, BRIGHTEST = 0.1, 0.98  # range of grey values with enough of the 8 bits and without clipping
 MIN_EVENTS = 400  # of either polarity
-HISTORY = 0.3  # seconds before a pair in which the last event of a pixel is looked for
-MIN_DIFFERENCE = 0.05  # of C+ and C-; smaller ones are within the errors of the estimate
+HISTORY = 0.3  # seconds before a pair that are searched for the last event of a pixel
+MIN_DIFFERENCE = 0.05  # relative, of C+ and C-; smaller differences are within the errors of the estimate
 LOG_EPSILON = 0.004
 RING = 5  # px; pixels of this square around a pixel, without the inner 3 x 3, are its instruments
 
 
 @dataclass(frozen=True)
 class ContrastThreshold:
-    """C and where it comes from."""
+    """C and its source."""
 
     value: float
     source: str  # "settings", "data", "images" or "default"
@@ -69,7 +69,7 @@ def contrast_threshold(
 ) -> ContrastThreshold:
     """Return the threshold that the settings or the data state, else an estimate, else the default.
 
-    What the settings state is the mean: how positive and negative events differ is estimated all the same.
+    The settings state the mean; the ratio C+ / C- is estimated nevertheless.
     """
     if sequence.contrast_threshold is not None and stated is None:
         return ContrastThreshold(sequence.contrast_threshold, "data")
@@ -85,7 +85,7 @@ def contrast_from_images(
     start: float,  # seconds
     end: float,
 ) -> ContrastThreshold | None:
-    """Return the threshold by brightness changes between images inside [start, end], None without enough."""
+    """Return the threshold estimated from images in [start, end]; None if they do not suffice."""
     stamps = sequence.image_timestamps
     inside = np.nonzero((stamps >= start) & (stamps <= end))[0]
     products = []
@@ -139,7 +139,7 @@ def _products(sequence: EventDepthSequence, first: int, second: int) -> _Product
 
 
 def _regressors(events: Events, start: float, shape: tuple[int, int]) -> np.ndarray:  # [2, H, W] float32
-    """Return p and -n from the start on, each with how far brightness lies beyond the last event."""
+    """Return p and -n from the start on, each corrected by the mean distance beyond the last event."""
     before = EventCounts(events.between(-np.inf, start), shape).last
     counts = EventCounts(events.between(start, np.inf), shape)
     last = np.where(counts.last == 0, before, counts.last)
@@ -152,7 +152,7 @@ def _regressors(events: Events, start: float, shape: tuple[int, int]) -> np.ndar
 
 
 def _solved(M: np.ndarray, v: np.ndarray) -> np.ndarray:  # [2, 2], [2] -> [2]
-    """Return M^-1 v, nan where the pixels do not tell positive and negative events apart."""
+    """Return M^-1 v; nan if the pixels do not determine C+ and C- separately."""
     if np.linalg.cond(M) > 1e6:
         return np.full(2, np.nan)
     return np.asarray(np.linalg.solve(M, v))

@@ -1,17 +1,17 @@
-"""Pixels that fire by themselves, and images in which their neighbours stand in for them."""
+"""Noisy pixels, which fire without a change of brightness, and their replacement by their neighbours."""
 
 import cv2
 import numpy as np
 
 from edslam_ti.frame import EventCounts
 
-NOISY = 10.0  # times the median of a pixel's neighbours: it fires by itself
-NOISY_EVENTS = 100  # a pixel with fewer is not called noisy
-AROUND = 5  # px, width of the square whose median is compared
+NOISY = 10.0  # a pixel is noisy if it has more than this many times the median events of its neighbours
+NOISY_EVENTS = 100  # a pixel with fewer events is not called noisy
+AROUND = 5  # px, width of the neighbourhood
 
 
 class NoisyPixels:
-    """Finds pixels that have had many times the events of those around them, since the first frame.
+    """Finds pixels that have had many times the events of their neighbours since the first frame.
 
     A pixel at 5 kHz is found in the first frame of 50 ms, one at 200 Hz after half a second.
     """
@@ -21,9 +21,9 @@ class NoisyPixels:
         self._numbers = np.zeros(shape, np.float32)  # of events
 
     def add(self, counts: EventCounts) -> None:
-        """Add the events of a frame that follows those added before."""
+        """Add a frame's events."""
         self._numbers += counts.numbers.sum(-1)
-        # The least of the neighbours is found far faster than their median, and is not larger.
+        # The minimum of the neighbours is far faster than their median, and not larger: a cheap first test.
         least = cv2.erode(self._numbers, np.ones((AROUND, AROUND), np.uint8))
         if not (self._numbers > np.maximum(NOISY * least, NOISY_EVENTS)).any():
             self.mask = np.zeros_like(self.mask)
@@ -32,7 +32,7 @@ class NoisyPixels:
         self.mask = self._numbers > np.maximum(NOISY * around, NOISY_EVENTS)
 
     def replaced(self, image: np.ndarray) -> np.ndarray:  # [H, W] float32
-        """Return an image with the median of their neighbours at noisy pixels; unchanged without any."""
+        """Return the image with noisy pixels replaced by the median of their neighbours."""
         if not self.mask.any():
             return image
         result = image.copy()

@@ -1,12 +1,12 @@
-"""Grey images without their motion blur: the events of an exposure tell what has changed during it.
+"""Removes motion blur from grey images with the events of their exposure.
 
-An image is the mean of brightness over its exposure, which for a moving camera is a mean over the poses of
-Eq. 9. Instead of rendering the map from many of them, events undo the mean (event double integral, Pan et
-al. 2019): with a the exposure's beginning and E(t) the change of log brightness since a, Eq. 11,
+An image is the mean of brightness over its exposure, for a moving camera a mean over the poses of Eq. 9.
+Instead of rendering the map from many poses, we undo the mean with events (event double integral, Pan et
+al. 2019). Let a be the start of the exposure and E(t) the change of log brightness since a (Eq. 11). Then
 
     B = I(a) * mean_t exp E(t)        so        log I(t) = log B - log mean_t exp E(t) + E(t)
 
-at any time t near by, such as that of a frame, also where the image was taken a little before it.
+at any time t close to the exposure, such as the time of the next frame.
 """
 
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.events import Events
 from edslam_ti.frame import Frame
 
-SAME_TIME = 1e-3  # seconds; an image this close to a frame is of its time
-DARKEST, BRIGHTEST = 1 / 255, 254 / 255  # an image that says so or beyond only bounds brightness
+SAME_TIME = 1e-3  # seconds; an image this close to a frame has the frame's time
+DARKEST, BRIGHTEST = 1 / 255, 254 / 255  # grey values from here outwards only bound brightness (clipped)
 
 
 @dataclass(frozen=True)
 class SharpImage:
-    """What a grey image says of log brightness."""
+    """Log brightness measured by a grey image."""
 
     log_brightness: np.ndarray  # [H, W] float32
-    clipped: np.ndarray  # [H, W] int8: 0 it is this, -1 this or darker, 1 this or brighter
+    clipped: np.ndarray  # [H, W] int8: 0 exact, -1 an upper bound, 1 a lower bound
 
     def imposed_on(self, image: np.ndarray) -> np.ndarray:
-        """Return another estimate of log brightness [H, W] made to agree with this one."""
+        """Return another estimate of log brightness [H, W], corrected to agree with this one."""
         low = np.where(self.clipped < 0, np.float32(-np.inf), self.log_brightness)
         high = np.where(self.clipped > 0, np.float32(np.inf), self.log_brightness)
         return np.clip(image, low, high)
 
 
 class SharpImages:
-    """Log brightness at the times of frames as a sequence's grey images tell it.
+    """Log brightness at the times of frames, from a sequence's grey images.
 
-    Half of an image's exposure lies behind its time, so that it is known that much later than its frame.
+    Half of an image's exposure comes after its time, so the result is available that much later.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class SharpImages:
         return last if last >= 0 and stamps[last] > after else None
 
     def _correction(self, taken: float, time: float, shape: tuple[int, ...]) -> np.ndarray:  # [H, W]
-        """Return the log brightness at a time less that of an image centred on `taken`."""
+        """Return the log brightness at `time` minus that of an image centred on `taken`."""
         start, end = taken - self._exposure / 2, taken + self._exposure / 2
         events = self._sequence.events(min(start, time), max(end, time))
         step = np.where(events.polarity > 0, self._steps[0], -self._steps[1])
@@ -85,13 +85,13 @@ class SharpImages:
 
 
 def change_from_mean(
-    events: Events,  # N; all between the earlier of start and time, and the later of end and time
-    step: np.ndarray,  # [N] change of log brightness that each stands for
+    events: Events,  # N; all from min(start, time) to max(end, time)
+    step: np.ndarray,  # [N] change of log brightness by each event
     exposure: tuple[float, float],  # start and end, seconds
     time: float,  # seconds
     shape: tuple[int, int],
 ) -> np.ndarray:  # [H, W] float64
-    """Return the log of the brightness at `time` over its mean during the exposure."""
+    """Return the log of the ratio of brightness at `time` to its mean during the exposure."""
     start, end = exposure
     pixel = events.y.astype(np.int64) * shape[1] + events.x
     size = shape[0] * shape[1]

@@ -1,22 +1,21 @@
-"""Log-brightness images solved from events, depth and poses: what a camera would have seen, without one.
+"""Log-brightness images solved from events, depth and poses, without a camera.
 
-With l the unknown log brightness at one time and E_k the change summed up from there to time k (Eq. 11), the
-image at time k is l + E_k. A surface point seen at pixel x of frame j and at x' = w(x) of frame k (Eq. 3,
-through measured depth) has one brightness:
+Let l be the unknown log brightness at one time and E_k the change from there to time k (Eq. 11). The image at
+time k is l + E_k. A surface point seen at pixel x of frame j and at x' = w(x) of frame k (Eq. 3, through
+measured depth) has the same brightness in both:
 
     l(x) + E_j(x) = l(x') + E_k(x')          for every pixel with depth and many pairs of frames
 
-with l and E_k at x' interpolated bilinearly. The equations are linear in l alone, and absolute brightness
-stays unknown. Unlike a time surface (Eq. 1), which lags its edges by an amount that depends on the motion,
-such an image belongs to the surfaces themselves, so that alignment to it is not biased. There are two uses:
+with l and E_k at x' interpolated bilinearly. The equations are linear in l, and leave absolute brightness
+unknown. A time surface (Eq. 1) lags behind its edges by an amount that depends on the motion. This image does
+not depend on the motion, so alignment to it is unbiased. There are two uses:
 
 - The tracker solves for the image at a keyframe's time, where E_j = 0, from pairs of the keyframe with a few
   other frames (`solve_log_brightness_image`), often and at reduced size.
-- The mapper solves for the image at the beginning of some seconds of events, from pairs of many frames
-  (`solve_start_image`). The unknowns are the pixels of one image however long the recording, so least squares
-  finds all of them in seconds, whatever their distance in the image, where descent on single intervals
-  (Eq. 12) needs thousands of steps for the low frequencies. Frames whose image is known already, from an
-  earlier start, tie their brightness in as a given.
+- The mapper solves for the image at the start of some seconds of events, from pairs of many frames
+  (`solve_start_image`). The unknowns are the pixels of one image, however long the recording, so least
+  squares takes seconds. Gradient descent on single intervals (Eq. 12) needs thousands of steps for the low
+  frequencies. Frames whose image is already known, from an earlier start image, enter as constants.
 """
 
 from collections.abc import Sequence
@@ -32,12 +31,12 @@ from edslam_ti.kernels import brightness_image, time_surface
 from edslam_ti.kernels.brightness_image import ChangeImage, Pair, solve_brightness_image
 from edslam_ti.kernels.runtime import check_shape
 
-# Log brightness; equations beyond count less (occlusions, reflections, wrong depth). Frames of a start image
-# are farther apart, and errors of their events have added up for longer.
+# Huber thresholds in log brightness; equations with larger residuals count less (occlusions, reflections,
+# wrong depth). Frames of a start image are farther apart, so errors of their events have accumulated longer.
 HUBER, START_HUBER = 0.1, 0.15
-ROBUST = (False, True)  # solutions of a start image: the second weighs equations by how the first fits them
-PRIOR_WEIGHT = 1e-3  # of the start's previous value against one equation
-OFFSETS = (1, 2, 5, 9)  # in the list of views, between the two of a pair
+ROBUST = (False, True)  # two solves of a start image: the second uses weights from the first one's residuals
+PRIOR_WEIGHT = 1e-3  # weight of the previous start image, relative to one equation
+OFFSETS = (1, 2, 5, 9)  # difference of the indices of a pair of views
 
 
 # --- the image of a keyframe ---
@@ -48,7 +47,7 @@ class Observation:
     """One time at which a keyframe's surfaces were seen."""
 
     T_camera_keyframe: np.ndarray  # [4, 4]
-    change: np.ndarray  # [h, w] log brightness: E_k, since the keyframe (before it: negative time)
+    change: np.ndarray  # [h, w] log brightness: E_k since the keyframe (for earlier times, minus the change)
     depth: np.ndarray | None  # [h, w] metres, 0 = missing; for occlusion
 
 
@@ -56,8 +55,8 @@ def solve_log_brightness_image(
     depth: np.ndarray,  # [h, w] of the keyframe, metres, 0 = missing
     camera: Camera,  # of these images
     observations: Sequence[Observation],
-    prior: np.ndarray,  # [h, w] log brightness before; stays where nothing was observed
-    prior_weight: float = 1e-3,  # against one equation
+    prior: np.ndarray,  # [h, w] previous log brightness; kept where nothing was observed
+    prior_weight: float = 1e-3,  # relative to one equation
     iterations: int = 12,
     is_robust: bool = True,
 ) -> np.ndarray:  # [h, w] float32
@@ -75,14 +74,14 @@ def solve_log_brightness_image(
     return image
 
 
-# --- the image at the beginning ---
+# --- the start image ---
 
 
 @dataclass(frozen=True)
 class EventView:
-    """What the event camera has measured up to the time of a frame."""
+    """Measurements of the event camera up to the time of a frame."""
 
-    change: np.ndarray  # [H, W] float32 log brightness less the start image, Eq. 11; absolute if not relative
+    change: np.ndarray  # [H, W] float32 log brightness, minus the start image if `is_relative` (Eq. 11)
     depth: np.ndarray | None  # [H, W] float32 metres, 0 = missing
     T_world_camera: np.ndarray  # [4, 4]
     is_relative: bool = True
@@ -90,21 +89,21 @@ class EventView:
 
 @dataclass(frozen=True)
 class StartImage:
-    """Log brightness at the beginning."""
+    """Log brightness at the start of a window."""
 
     log_brightness: np.ndarray  # [H, W] float32
-    is_observed: np.ndarray  # [H, W] bool: compared with other pixels; elsewhere as the neighbours
+    is_observed: np.ndarray  # [H, W] bool: compared with other pixels; elsewhere interpolated
 
 
 def solve_start_image(
     views: Sequence[EventView],  # in order of time
     camera: Camera,
-    start: np.ndarray,  # [H, W] float32, where to begin; stays where nothing is observed
-    iterations: dict[int, int],  # of conjugate gradients by reduction of the images, coarse first
+    start: np.ndarray,  # [H, W] float32, initial value
+    iterations: dict[int, int],  # of conjugate gradients for each reduction of the images, coarse first
 ) -> StartImage:
     """Return the start image, by iteratively reweighted least squares from coarse to fine.
 
-    Only its difference to `start` is at reduced size: details of `start` smaller than that survive.
+    Only its difference to `start` is solved at reduced size, so smaller details of `start` survive.
     """
     log_brightness, observed = start.astype(np.float32), np.zeros(camera.shape, bool)
     T_camera_world = [inverse(v.T_world_camera) for v in views]
@@ -128,7 +127,7 @@ def _reduced(view: EventView, reduction: int) -> ChangeImage:
 
 
 def _pairs(views: Sequence[EventView]) -> list[tuple[int, int]]:
-    """Return pairs of views at short and long distances in the list, both ways."""
+    """Return pairs of views at short and long distances in the list, in both directions."""
     offsets = OFFSETS if len(views) < 12 else OFFSETS[1:]
     pairs = [(k, k + o) for o in offsets for k in range(len(views) - o)]
     pairs += [(j, k) for k, j in pairs]
@@ -147,7 +146,7 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:  # [h, w]
 
 
 def _enlarged(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:  # [h, w] -> [H, W]
-    """Return an image of block means at full size, bilinearly; odd edges repeat the last block."""
+    """Return an image of block means enlarged bilinearly to full size; odd edges repeat the last block."""
     if image.shape == shape:
         return image
     r = shape[1] // image.shape[1]
@@ -157,6 +156,6 @@ def _enlarged(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:  # [h, w
 
 
 def compile_kernels() -> None:
-    """Compile what images need, so that the first frames of a sequence need not wait for it."""
+    """Compile the kernels that images need, so that the first frames of a sequence do not wait for it."""
     brightness_image.compile_kernels()
     time_surface.compile_kernels()

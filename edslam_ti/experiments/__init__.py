@@ -1,1 +1,1 @@
-"""Measurements over many recordings: what `edslam reproduce` runs, and how its tables come about."""
+"""Measurements over many recordings: the runs of `edslam reproduce`, and its tables."""

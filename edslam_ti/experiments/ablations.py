@@ -1,4 +1,4 @@
-"""Ablations of the tracker: one setting changed at a time, as the paper's Tables I and II and beyond."""
+"""Ablations of the tracker: change one setting at a time, as in the paper's Tables I and II and beyond."""
 
 import functools
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from edslam_ti.experiments.cases import Case, Recording
 from edslam_ti.experiments.runs import Variant
 from edslam_ti.methods import METHODS
 
-NO_SURFACE = 1e4  # a standard deviation so large that time surfaces count for nothing
+NO_SURFACE = 1e4  # a standard deviation so large that time surfaces have no weight
 SURFACES = {"brightness": False}  # time surfaces and depth, without brightness images
 
 Changes = dict[str, Any]  # tracking settings, dots for nested ones, that differ from a method's own
 
-# What is changed -> the method, and label of a row -> changes.
+# Changed setting -> method, and label of each row -> its changes.
 TABLES: dict[str, tuple[str, dict[str, Changes]]] = {
     "Residuals": (
         "ed_slam",

@@ -1,6 +1,6 @@
-"""What `edslam benchmark` does: time the suites on one engine or several, print a table and write it.
+"""The command `edslam benchmark`: times the suites on one or several engines, prints a table and writes it.
 
-An engine is chosen once for a process, so further engines run in child processes, before the table begins.
+A process can load only one engine, so further engines run in child processes before the table is printed.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ Suite = Literal[
 ]
 Engine = Literal["taichi", "quadrants"]
 KERNELS: tuple[Suite, ...] = ("time_surface", "tracking", "rasterizer", "mapping_step")
-WHOLE_RUNS = ("cold_start", "slam")  # suites of which every row depends on the engine
+WHOLE_RUNS = ("cold_start", "slam")  # suites in which every row depends on the engine
 
 CHILD = """
 import json, sys
@@ -47,7 +47,7 @@ def benchmark(
     duration: float = 1.0,
     out: Path | str | None = None,
 ) -> None:
-    """Time the kernels and what is built of them; see `edslam benchmark --help` for the arguments.
+    """Time the kernels and the steps built on them; `edslam benchmark --help` explains the arguments.
 
     Raises EdSlamError when the engine or the device is missing.
     """
@@ -106,7 +106,7 @@ def _load_engine(name: Engine | None) -> None:
 
 
 def _in_child(engine: str, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of a benchmark that another engine runs, as they stand in benchmark.json."""
+    """Return the rows of a benchmark that another engine runs, as in benchmark.json."""
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, "-c", CHILD, json.dumps({**settings, "out": folder})],
@@ -121,14 +121,14 @@ def _in_child(engine: str, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def header(others: Sequence[str]) -> list[str]:
-    """Return the first two lines of the table; each of the other engines has a column of wall times."""
+    """Return the first two lines of the table, with a column of wall times for each other engine."""
     line = "| task | | wall ms | CPU ms | wall / first | CPU / first | limit ms |"
     rule = "|---|---|--:|--:|--:|--:|--:|"
     return [line + "".join(f" {name} wall ms |" for name in others), rule + len(others) * "--:|"]
 
 
 def _columns(row: "Row", others: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Return what the other engines took for the same; empty columns for what no engine runs."""
+    """Return the wall times of the other engines for the same task; empty if they did not run it."""
     from edslam_ti.experiments.kernel_times import OURS
 
     text = ""

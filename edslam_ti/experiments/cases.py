@@ -1,4 +1,4 @@
-"""The cases of the tracking bench: which recording, and what is done to it while it is read."""
+"""The cases of the tracking benchmark: a recording, and its alterations while it is read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ DURATION = 2.5  # seconds
 LONG_DURATION = 30.0  # seconds, about 10 m
 QUICK_DURATION = 1.2  # seconds
 GAP = (1.0, 0.5)  # start and length in seconds
-POSE_RATE = 200.0  # true poses per second: poses between depth images are judged too
-MEASURED = "measured"  # depth that comes with real data
+POSE_RATE = 200.0  # true poses per second, so that poses between depth images are evaluated, too
+MEASURED = "measured"  # depth of real data
 RECORDED = "recorded"  # a path that is not simulated
 MESH_SCENE, REAL_SCENE = "viking_room", "slider_depth"  # of the data folder
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What is simulated (once), or read from the data folder: exact depth at 20 Hz."""
+    """A recording that is simulated once, or read from the data folder: exact depth at 20 Hz."""
 
     scene: str
     path: str = "hand_held"
@@ -28,7 +28,7 @@ class Recording:
 
     @property
     def settings(self) -> SimulationConfig:
-        """The simulation's settings; a recorded path is no path of a room."""
+        """The simulation's settings; a recorded path is not one of the room's paths."""
         return SimulationConfig(
             path="hand_held" if self.path == RECORDED else self.path,
             speed=self.speed,
@@ -41,9 +41,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class Case:
-    """One line of results before seeds are put together."""
+    """One test case: one seed of a line of results."""
 
-    group: str  # what it is a test of
+    group: str  # aspect that it tests
     recording: Recording
     depth: str = "exact"  # or kinect, measured
     rate: float = 20.0  # depth images per second
@@ -52,7 +52,7 @@ class Case:
 
     @property
     def row(self) -> str:
-        """What all seeds of a case share, readable."""
+        """Readable name of the row, the same for all seeds."""
         recording = self.recording
         words = [recording.scene]
         if recording.path != "hand_held":
@@ -69,12 +69,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """A name that serves as a folder name, too."""
+        """Name of the case, also used as a folder name."""
         return f"{self.row}-seed{self.recording.seed}"
 
 
 def all_cases(seeds: Sequence[int] = (0, 1, 2)) -> list[Case]:
-    """Return the whole bench; cases of one recording follow each other."""
+    """Return all cases; those of one recording are consecutive."""
     cases = []
     for seed in seeds:
         for scene in ROOM_NAMES:
@@ -114,7 +114,7 @@ def _depths(group: str, recording: Recording, rates: tuple[float, ...] = (20.0,)
 
 
 def _order(case: Case) -> int:
-    """Long and special recordings come after the rooms."""
+    """Return the sort key that puts long and special recordings after the rooms."""
     groups = (
         "rooms",
         "wall",

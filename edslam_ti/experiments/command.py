@@ -1,4 +1,4 @@
-"""What `edslam reproduce` does: its commands, and what each of them takes."""
+"""The command `edslam reproduce`: its subcommands and their options."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,7 @@ from edslam_ti.experiments.selection import Selection
 
 
 class TrackingOptions(Selection):
-    """Which cases, methods and places."""
+    """Cases, methods and folders."""
 
     methods: tuple[str, ...] = ("ed_slam", "ed_slam_paper", "open3d_icp", "open3d_rgbd")
     """Methods to compare, side by side in the tables."""
@@ -26,7 +26,7 @@ class TrackingOptions(Selection):
     mapping: bool = False
     """Run the whole system instead of tracking alone."""
     fresh: bool = False
-    """Run again what has a result already."""
+    """Repeat runs that have a result already."""
     keep_recordings: bool = True
     """false: delete each simulated recording after its last case."""
     threads: int = 2
@@ -34,7 +34,7 @@ class TrackingOptions(Selection):
 
 
 def tracking(options: TrackingOptions) -> None:
-    """Run methods over the bench."""
+    """Run methods on the cases of the tracking benchmark."""
     load_kernels()
     from edslam_ti.experiments.cases import all_cases, quick_cases
     from edslam_ti.experiments.recordings import Recordings
@@ -50,14 +50,14 @@ def tracking(options: TrackingOptions) -> None:
     results: list[dict[str, Any]] = []
     try:
         results.extend(run_all(cases, variants, recordings, out, Console(), options.threads, fresh, keep))
-    finally:  # what there is before Ctrl-C, too
+    finally:  # write partial results after Ctrl-C, too
         if results:
             table = write_report(results, out, "Tracking")
             print(f"{table}: {len(results)} of {len(cases) * len(variants)} runs")
 
 
 class AblationOptions(Stage):
-    """Which recordings, and where the tables go."""
+    """Recordings, and output of the tables."""
 
     scenes: tuple[str, ...] = ("office0", "room0", "wall")
     """Built-in scenes, with Kinect-like depth at 20 Hz."""
@@ -66,10 +66,10 @@ class AblationOptions(Stage):
     out: Path = Path("results/ablations")
     """Folder that receives ablations.md and one file per run."""
     document: Path | None = None
-    """Markdown file that gets the tables, too, between its lines `<!-- ablations -->` and
+    """Markdown file that also receives the tables, between its lines `<!-- ablations -->` and
     `<!-- end ablations -->`."""
     fresh: bool = False
-    """Run again what has a result already."""
+    """Repeat runs that have a result already."""
     threads: int = 2
     """CPU threads."""
 
@@ -93,16 +93,16 @@ def ablations(options: AblationOptions) -> None:
 
 
 class LongStreamOptions(Stage):
-    """Which recording, and how it is measured."""
+    """Recording, and settings of the measurement."""
 
     recording: Path | None = None
     """Folder in EventReplica's layout; omitted: the loop through a built-in room."""
     scene: str = "office0"
     """Built-in room; 30 s of office0 take 4 GB at full size."""
     duration: float = 30.0
-    """Seconds of the made recording."""
+    """Length of the simulated recording in seconds."""
     rounds: int = 2
-    """How often a recording that ends where it began is played."""
+    """Number of times to play the recording, which must end where it began."""
     width: int = 384
     """Of the made recording, pixels."""
     height: int = 240
@@ -110,7 +110,7 @@ class LongStreamOptions(Stage):
     config: Path | None = None
     """YAML file with settings that differ from the defaults."""
     length: float = 5.0
-    """Seconds of data that a line of the table covers."""
+    """Seconds of data per line of the table."""
     out: Path = Path("results/long_stream")
     """Folder that receives long_stream.md, long_stream.png and frames.csv."""
     threads: int = 2
@@ -118,7 +118,7 @@ class LongStreamOptions(Stage):
 
 
 def long_stream(options: LongStreamOptions) -> None:
-    """Measure time per frame, memory and size of the map along a recording, tracking and mapping."""
+    """Measure time per frame, memory and size of the map while tracking and mapping a recording."""
     load_kernels()
     from edslam_ti import kernels
     from edslam_ti.config import Config, read_differences
@@ -145,12 +145,12 @@ def long_stream(options: LongStreamOptions) -> None:
 
 
 class ReportOptions(Stage):
-    """Which documents."""
+    """Documents to update."""
 
     root: Path = Path()
-    """Checkout that holds README.md and docs/."""
+    """Checkout that contains README.md and docs/."""
     check: bool = False
-    """Change nothing, and fail if a document differs from its numbers."""
+    """Change nothing; fail if a document differs from the stored numbers."""
 
 
 def report(options: ReportOptions) -> None:
@@ -160,7 +160,7 @@ def report(options: ReportOptions) -> None:
     report_tables(options.root, options.check)
 
 
-# command -> its options, and what it does with them
+# command -> its options and its function
 COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
     "tracking": (TrackingOptions, tracking),
     "ablations": (AblationOptions, ablations),

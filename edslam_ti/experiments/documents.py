@@ -1,15 +1,15 @@
-"""Tables of the documents: numbers are stored in docs/results/NAME.json, and written between marks.
+"""Writes the tables of the documents, between marks, from the numbers in docs/results/NAME.json.
 
 A document shows the table NAME between the lines `<!-- NAME -->` and `<!-- end NAME -->`. A file of numbers
-holds the columns in order, and the rows; every row says which command measured it, at which commit:
+contains the columns in order, and the rows; every row states the command and the commit that measured it:
 
     {"columns": [{"key": "scene", "title": "scene"}, {"key": "ate_cm", "title": "ATE cm", "decimals": 2}],
      "rows": [{"command": "edslam slam --scene office0", "commit": "d9f0d6c", "version": "0.1.0",
                "source": "README.md", "values": {"scene": "office0", "ate_cm": 0.02}}]}
 
 A column of numbers states its "decimals" (with "whole_from_10": none from 10 on) or "significant" digits.
-A value is a text, a number, a list of numbers (one a seed: shown as median and range), an object {"mean",
-"worst", "lost"} over runs (one number where they are equal), or null where nothing was measured.
+A value is a text, a number, a list of numbers (one per seed, shown as median and range), an object {"mean",
+"worst", "lost"} over runs (shown as one number if they are equal), or null if nothing was measured.
 """
 
 import json
@@ -24,8 +24,8 @@ from edslam_ti.experiments.report import inserted
 from edslam_ti.output import atomic_file
 
 MARK = re.compile(r"^<!-- (?!end )(\w+) -->$", re.MULTILINE)
-PROVENANCE = ("command", "commit", "version", "source")  # what every row must say of itself
-WHOLE_FROM = 10.0  # larger values need no decimals, in columns that ask for it
+PROVENANCE = ("command", "commit", "version", "source")  # every row must state these
+WHOLE_FROM = 10.0  # larger values have no decimals in columns with "whole_from_10"
 
 
 def report_tables(root: Path, check: bool) -> None:
@@ -42,7 +42,7 @@ def report_tables(root: Path, check: bool) -> None:
 
 
 def documents_in(root: Path) -> list[Path]:
-    """Return the documents that hold tables; the frozen ones in docs/log hold their own."""
+    """Return the documents with tables, without the frozen ones in docs/log."""
     found = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     if not found[0].is_file():
         raise DataError(f"{root}: no README.md there; run this in a checkout, or name one with --root")
@@ -64,12 +64,12 @@ def write_tables(root: Path) -> list[Path]:
 
 
 def differing_documents(root: Path) -> list[Path]:
-    """Return the documents whose tables are not what the stored numbers say."""
+    """Return the documents whose tables differ from the stored numbers."""
     return [path for path in documents_in(root) if with_tables(path, root) != path.read_text()]
 
 
 def with_tables(document: Path, root: Path) -> str:
-    """Return the text of a document with its tables made anew."""
+    """Return the text of a document with up-to-date tables."""
     text = document.read_text()
     for name in table_names(document):
         text = inserted(text, name, "\n".join(table_lines(read_table(root, name))), document)
@@ -77,7 +77,7 @@ def with_tables(document: Path, root: Path) -> str:
 
 
 def read_table(root: Path, name: str) -> dict[str, Any]:
-    """Return a stored table, checked: every row has all columns, and says where it comes from."""
+    """Return a stored table after checking that every row has all columns and states its source."""
     path = root / "docs" / "results" / f"{name}.json"
     if not path.is_file():
         raise DataError(f"{path} not found; a document shows the table '{name}'")
@@ -107,12 +107,12 @@ def table_lines(table: Mapping[str, Any]) -> list[str]:
 
 
 def is_number(column: Mapping[str, Any]) -> bool:
-    """Return whether a column says how its numbers are written: by decimals or by significant digits."""
+    """Return whether a column contains numbers: it states decimals or significant digits."""
     return "decimals" in column or "significant" in column
 
 
 def cell(value: Any, column: Mapping[str, Any]) -> str:
-    """Return a value as a table shows it, with the decimals of its column."""
+    """Return the text of a table's cell, with the decimals of its column."""
 
     def shown(number: float) -> str:
         if "significant" in column:

@@ -1,4 +1,4 @@
-"""How many events a second the front end takes in: first opening, reading, counting, time surface."""
+"""Times the front end: first opening of a recording, reading, counting, time surface."""
 
 import os
 import tempfile
@@ -17,10 +17,10 @@ from edslam_ti.frame import FrameBuilder
 from edslam_ti.output import write_npy_header
 from edslam_ti.tracking.surfaces import SurfaceFrameBuilder
 
-RATE = 20e6  # events a second of a recording, as of a fast sensor in fast motion
+RATE = 20e6  # events per second of the recording, as of a fast sensor in fast motion
 NUM_SLICES = 4  # of the recording
-AT_ONCE = 1_000_000  # events made at once
-BYTES_PER_EVENT = 13  # that are read
+AT_ONCE = 1_000_000  # events generated at once
+BYTES_PER_EVENT = 13  # bytes read per event
 
 
 def write_recording(path: Path, size: tuple[int, int], count: int) -> None:
@@ -39,7 +39,7 @@ def write_recording(path: Path, size: tuple[int, int], count: int) -> None:
 
 
 def front_end(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
-    """Check a recording of slices of `count` events, and take in one slice after another."""
+    """Time the check of a recording, and the processing of its slices of `count` events one by one."""
     total = max(NUM_SLICES * count, IN_MEMORY + 1)
     camera = Camera(*size, size[0] / 2, size[0] / 2, (size[0] - 1) / 2, (size[1] - 1) / 2)
     cache = os.environ.get("EDSLAM_CACHE")
@@ -50,7 +50,7 @@ def front_end(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[R
             write_recording(recording, size, total)
 
             def check() -> EventFile:
-                os.utime(recording)  # so that it is checked again
+                os.utime(recording)  # a new modification time makes it be checked again
                 return EventFile(recording, *size)
 
             task = f"{size[0]}x{size[1]}, {total} events: check and copy"

@@ -1,9 +1,9 @@
-"""Kernels timed in turn with alternatives that compute the same: torch, numpy, and others where installed.
+"""Times kernels against alternatives that compute the same: torch, numpy, and others if installed.
 
-Everything runs in one process, one candidate after the other in every round, so that whatever else the
-machine does hits all of them; medians of the rounds. CPU time counts all threads. The least time that the
-machine could take follows from the bytes that must be moved and the operations that must be done, and from
-the bandwidth and the rate that torch reaches here.
+Everything runs in one process. Every round times one candidate after the other, so that other load on the
+machine affects all of them; results are medians of the rounds. CPU time counts all threads. The machine's
+limit follows from the bytes that must be moved and the operations that must be done, and from the bandwidth
+and the rate that torch reaches here.
 """
 
 import importlib.util
@@ -43,11 +43,11 @@ from edslam_ti.kernels.time_surface import MANY_EVENTS, time_surface, update_las
 from edslam_ti.kernels.view_losses import compare_change, compare_view
 
 OURS = ENGINE.capitalize()  # in the names of rows
-TWIN_LIMIT = 3e7  # Gaussians times pixels that the torch twin still manages, all at once
-DV_LIMIT = 2_000_000  # events: dv-processing takes them from Python one by one
+TWIN_LIMIT = 3e7  # Gaussians times pixels up to which the torch twin, which computes all at once, is timed
+DV_LIMIT = 2_000_000  # events; dv-processing takes them from Python one by one
 NUM_PATCHES, PATCH_SIZE = 400, 9
 MIN_SAMPLE = 0.005  # seconds
-SLOW = 2.0  # seconds a call: timed once
+SLOW = 2.0  # seconds; longer calls are timed once
 # Floating point operations, counted in the formulas
 FLOPS_FORWARD, FLOPS_BACKWARD = 30, 48  # of a (pixel, Gaussian) pair
 FLOPS_LINEARISE = 230  # of a patch pixel: warp, two samples, two Jacobians, 2 x 27 sums
@@ -60,7 +60,7 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels
 
 @dataclass(frozen=True)
 class Work:
-    """What a task cannot do without."""
+    """Memory traffic and operations that a task needs at least."""
 
     num_bytes: float = 0.0
     flops: float = 0.0
@@ -75,13 +75,13 @@ class Row:
     name: str
     wall_ms: float
     cpu_ms: float
-    wall_times_ours: float  # wall time in units of ours
+    wall_times_ours: float  # wall time divided by that of our kernel
     cpu_times_ours: float
-    limit_ms: float | None  # the least that the machine could take; None: not counted
-    rounds: int  # timings
+    limit_ms: float | None  # the machine's limit; None: not counted
+    rounds: int  # number of timings
 
     def as_markdown(self) -> str:
-        """Return the row of a table: task, name, wall and CPU ms, both in units of ours, limit ms."""
+        """Return the row of a table: task, name, wall and CPU ms, both divided by ours, limit ms."""
         times = (
             f"{self.wall_ms:.3g} | {self.cpu_ms:.3g} | {self.wall_times_ours:.2f} | {self.cpu_times_ours:.2f}"
         )
@@ -90,7 +90,7 @@ class Row:
 
 
 def processor() -> str:
-    """Return the processor's name, where Linux tells it, and the number of its cores."""
+    """Return the processor's name, if Linux states it, and the number of its cores."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -98,7 +98,7 @@ def processor() -> str:
 
 
 class Stopwatch:
-    """Times candidates in turn, on a machine whose limits it has measured; or the first of them alone."""
+    """Measures the machine's limits, and times candidates in turn (or the first one alone)."""
 
     def __init__(self, rounds: int, has_alternatives: bool = True) -> None:
         self._rounds = rounds
@@ -119,16 +119,16 @@ class Stopwatch:
         return min(seconds)
 
     def _calls(self, run: Callable[[], object]) -> tuple[int, int]:
-        """Return how many calls make a sample long enough to be timed, and of how many samples; warms up."""
+        """Warm up; return the number of calls per sample, for a measurable duration, and of samples."""
         _seconds(run)
         seconds, _ = _seconds(run)
         return max(1, min(1000, int(MIN_SAMPLE / seconds))), 1 if seconds > SLOW else self._rounds
 
     def compare(self, suite: str, task: str, candidates: Candidates, work: Work | None = None) -> list[Row]:
-        """Return the medians of all candidates; the first calls of each are not counted."""
+        """Return the medians of all candidates; the first calls of each do not count."""
         if not self.has_alternatives:
             candidates = dict(list(candidates.items())[:1])
-        # Short ones are called many times for one sample: all of them then find their data in the cache.
+        # A sample of a short candidate has many calls: then all of them find their data in the cache.
         calls = {name: self._calls(run) for name, run in candidates.items()}
         samples: dict[str, list[tuple[float, float]]] = {name: [] for name in candidates}
         for k in range(self._rounds):
@@ -151,7 +151,7 @@ class Stopwatch:
 
 
 def _seconds(run: Callable[[], object], calls: int = 1) -> tuple[float, float]:
-    """Return wall and CPU seconds of a call, the mean of several in a row."""
+    """Return wall and CPU seconds per call, the mean over consecutive calls."""
     _finish_device()
     wall, cpu = time.perf_counter(), time.process_time()
     for _ in range(calls):
@@ -161,7 +161,7 @@ def _seconds(run: Callable[[], object], calls: int = 1) -> tuple[float, float]:
 
 
 def _finish_device() -> None:
-    """Wait for what was launched; a CPU has finished already."""
+    """Wait for launched kernels; on a CPU they have finished already."""
     if is_gpu():
         synchronize()
 
@@ -239,7 +239,7 @@ def count_pairs(inputs: Inputs, intrinsics: tuple[float, ...], size: tuple[int, 
 
 
 def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str = "cpu") -> Iterator[Row]:
-    """Render a view; render it and compute all gradients, pose included."""
+    """Time rendering of a view, and rendering with all gradients, including the pose's."""
     inputs, intrinsics = room_scene(count, *size)
     pairs = count_pairs(inputs, intrinsics, size)
     inputs = _inputs(x.to(device) for x in inputs)
@@ -259,7 +259,7 @@ def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str 
         return torch.autograd.grad(loss, tensors)
 
     renders: dict[str, Render] = {OURS: kernel}
-    if device == "cpu":  # the alternatives make tensors on the CPU
+    if device == "cpu":  # the alternatives create tensors on the CPU
         renders["torch pair list"] = lambda *x: rasterize_pairs(*_inputs(x), intrinsics, size)
         if size[0] * size[1] * count <= TWIN_LIMIT:
             renders["torch twin"] = twin
@@ -279,14 +279,14 @@ def rasterizer(size: tuple[int, int], count: int, watch: Stopwatch, device: str 
 
 
 def surface(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
-    """Take in a batch of events; evaluate the surface."""
+    """Time the update by a batch of events, and the evaluation of the surface."""
     rng = np.random.default_rng(0)
     t = np.sort(rng.uniform(0, 1, count))
     last = np.full((size[1], size[0]), -np.inf)
     everywhere = [rng.integers(0, n, count).astype(np.int16) for n in size]
     task = f"{size[0]}x{size[1]}, {count} events"
     yield from _update(f"{task}: update", everywhere, t, last, watch)
-    # Most of them in the middle, none at all in the corners
+    # Most events in the middle, none in the corners
     middle = [np.clip(rng.normal(n / 2, n / 6, count), 0, n - 1).astype(np.int16) for n in size]
     yield from _update(f"{task}, most in the middle: update", middle, t, last, watch)
     evaluations = {
@@ -304,7 +304,7 @@ def _update(
     last: np.ndarray,  # [H, W] float64 seconds
     watch: Stopwatch,
 ) -> Iterator[Row]:
-    """Take in a batch of events."""
+    """Time the update by a batch of events."""
     x, y = places
     height, width = last.shape
     x_of_twin, y_of_twin, t_of_twin = map(torch.from_numpy, (x, y, t))
@@ -408,7 +408,7 @@ def linearise_in_torch(
     patches: Patches, surface: np.ndarray, depth: np.ndarray, T_b_a: np.ndarray,
     intrinsics: tuple[float, ...], model: ResidualModel, inverse: bool,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """The same from the torch twin's residuals, by forward differentiation along the six twists."""
+    """Return the same from the torch twin's residuals, by forward differentiation along the six twists."""
     arrays = (patches.pixels, patches.values, surface, depth)
     pixels, values, image, depths = map(torch.from_numpy, arrays)
     T = torch.from_numpy(T_b_a).float()
@@ -456,7 +456,7 @@ def tracking_inputs(size: tuple[int, int]) -> tuple[Patches, np.ndarray, np.ndar
 
 
 def tracking(size: tuple[int, int], watch: Stopwatch) -> Iterator[Row]:
-    """Linearise the alignment once, both directions, as an iteration of the tracker does."""
+    """Time one linearisation of the alignment in both directions, as in an iteration of the tracker."""
     intrinsics, model = (0.8 * size[0], 0.8 * size[0], size[0] / 2, size[1] / 2), ResidualModel()
     patches, surface, depth, T = tracking_inputs(size)
     view = np.stack([surface, depth], -1)[None]
@@ -511,7 +511,7 @@ print(json.dumps(stamps))
 
 
 def run_every_kernel() -> None:
-    """Run what a run of SLAM runs, on next to nothing: afterwards all of it is compiled."""
+    """Run all kernels of a SLAM run on tiny inputs, so that all of them are compiled."""
     inputs, intrinsics = room_scene(20, 16, 12)
     view = rasterize(*_inputs(x.requires_grad_() for x in inputs), intrinsics, (16, 12))
     (view.image.sum() + view.depth.sum()).backward()
@@ -527,7 +527,7 @@ def run_every_kernel() -> None:
 
 
 def cold_start(threads: int, rounds: int) -> Iterator[Row]:
-    """Yield what the parts of a start cost in a fresh process, Taichi's cache of compiled kernels warm."""
+    """Yield the times of the parts of a start in a fresh process, with Taichi's kernel cache warm."""
     code = FRESH_PROCESS.format(threads=threads)
     samples = []
     for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""The cost of a long stream: time per frame and memory, and what the memory holds, over time."""
+"""Measures the cost of a long stream: time per frame, and memory by its use, over time."""
 
 import csv
 import time
@@ -20,12 +20,12 @@ from edslam_ti.pipeline import contrast_of, held_out_frames, make_slam
 from edslam_ti.results.pictures import new_figure, save_figure
 from edslam_ti.slam import Slam
 
-WARM_UP = 10.0  # seconds of data after which memory may grow by the map alone
+WARM_UP = 10.0  # seconds of data, after which only the map may make memory grow
 
 
 @dataclass(frozen=True)
 class FrameCost:
-    """What one frame took, and what there is after it."""
+    """Cost of one frame, and memory after it."""
 
     timestamp: float  # seconds of data
     cpu_s: float  # of the whole process
@@ -33,9 +33,9 @@ class FrameCost:
     mapping_s: float  # wall time
     memory_mb: float  # resident
     num_gaussians: int
-    map_mb: float  # of that, the map with its optimiser's moments
-    frames_mb: float  # images from events, depth: what the mapper keeps of frames
-    tracker_mb: float  # its keyframes, old ones too, and recent frames
+    map_mb: float  # part of it: the map with its optimiser's moments
+    frames_mb: float  # part of it: frames kept by the mapper (event images, depth)
+    tracker_mb: float  # part of it: the tracker's keyframes, including old ones, and recent frames
 
 
 def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameCost]:
@@ -62,16 +62,16 @@ def frame_costs(sequence: EventDepthSequence, config: Config) -> Iterator[FrameC
 
 def _held_mb(slam: Slam) -> tuple[float, float, float]:
     """Return the megabytes held by the map, by the rest of the mapper, and by the tracker."""
-    counted: set[int] = set()  # memory that two of them hold counts for the first
+    counted: set[int] = set()  # shared memory counts for the first owner
     the_map = None if slam.mapper is None else slam.mapper.map
     held = [held_bytes(part, counted) / 2**20 for part in (the_map, slam.mapper, slam.tracker)]
     return held[0], held[1], held[2]
 
 
 def held_bytes(root: Any, counted: set[int]) -> int:
-    """Return the bytes of all arrays reachable from an object of this package, each memory once.
+    """Return the bytes of all arrays reachable from an object of this package; shared memory counts once.
 
-    `counted`: addresses that were counted before; new ones are added. Memory-mapped files do not count.
+    `counted`: addresses counted before; new ones are added. Memory-mapped files do not count.
     """
     total, waiting, visited = 0, [root], set[int]()
     while waiting:
@@ -99,7 +99,7 @@ def held_bytes(root: Any, counted: set[int]) -> int:
 
 
 def _newly_counted(address: int, size: int, counted: set[int]) -> int:
-    """Return the size of what lies at an address, 0 if it has been counted."""
+    """Return `size`, or 0 if the memory at this address has been counted."""
     is_new = size > 0 and address not in counted
     counted.add(address)
     return size if is_new else 0
@@ -111,8 +111,8 @@ class Window:
 
     start: float  # seconds of data
     end: float
-    cpu_s: float  # a frame
-    memory_mb: float  # the most after any frame: it falls whenever free memory goes back
+    cpu_s: float  # per frame
+    memory_mb: float  # maximum after any frame; it falls whenever free memory is returned to the system
     num_gaussians: int
     map_mb: float
     frames_mb: float
@@ -120,7 +120,7 @@ class Window:
 
     @property
     def other_mb(self) -> float:
-        """Libraries, buffers of rendering, and what the allocator keeps for later."""
+        """Memory of libraries, of rendering buffers, and free memory kept by the allocator."""
         return self.memory_mb - self.map_mb - self.frames_mb - self.tracker_mb
 
 
@@ -145,9 +145,9 @@ def windows(costs: Sequence[FrameCost], length: float) -> list[Window]:
 
 
 def table(rows: Sequence[Window]) -> str:
-    """Return Markdown: a line for every window, then what has grown since the warm-up.
+    """Return a Markdown table with a line for every window, then the growth since the warm-up.
 
-    CPU time of all threads: wall time says more about what else the machine does.
+    It shows CPU time of all threads, because wall time depends on other load of the machine.
     """
     lines = [
         "| seconds of data | Gaussians | resident MB | map | frames | tracker | other | CPU s a frame |",
@@ -180,7 +180,7 @@ def _line(row: Window) -> str:
 
 
 def plot(path: Path, rows: Sequence[Window]) -> None:
-    """Draw time a frame, and memory with the size of the map, against seconds of data."""
+    """Plot time per frame, and memory with the size of the map, against seconds of data."""
     figure = new_figure(9, 3.2)
     seconds, memory = figure.subplots(1, 2)
     middle = [(r.start + r.end) / 2 for r in rows]
@@ -201,7 +201,7 @@ def plot(path: Path, rows: Sequence[Window]) -> None:
 def measure(
     sequence: EventDepthSequence, config: Config, out: Path, length: float, report: Callable[[str], None]
 ) -> None:
-    """Run the sequence, report the table's newest line every `length` seconds, and write the results.
+    """Run the sequence, report the newest line of the table every `length` seconds, and write the results.
 
     frames.csv, long_stream.md and long_stream.png are written when the run ends or is interrupted.
     """
@@ -211,7 +211,7 @@ def measure(
             if costs and int(cost.timestamp / length) > int(costs[-1].timestamp / length):
                 report(_line(windows(costs, length)[-1]))
             costs.append(cost)
-    finally:  # what there is before Ctrl-C, too
+    finally:  # write partial results after Ctrl-C, too
         if costs:
             _write(out, costs, windows(costs, length))
 

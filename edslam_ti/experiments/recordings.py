@@ -1,4 +1,4 @@
-"""Recordings of the bench: simulated on first use, or found in the data folder."""
+"""Recordings of the tracking benchmark: simulated on first use, or found in the data folder."""
 
 import hashlib
 import shutil
@@ -16,7 +16,8 @@ from edslam_ti.experiments.cases import MESH_SCENE, REAL_SCENE, Recording
 from edslam_ti.simulation import RecordedPath, load_mesh, look_at, simulate
 from edslam_ti.trajectory import read_tum
 
-# The mesh in metres, and where a real hand-held path (hdr_normal, quicker towards its end) runs in it.
+# Scale of the mesh to metres, and placement in it of a real hand-held path (hdr_normal, faster towards its
+# end).
 MESH_SCALE, MESH_FILE = 4.0, Path("scenes") / MESH_SCENE / f"{MESH_SCENE}.obj"
 MESH_POSITION, MESH_TARGET = np.array([1.6, 1.6, 1.6]), np.array([-0.5, -0.5, 0.8])
 PATH_FILE, PATH_STARTS, PATH_SCALE = Path("trajectories") / "hdr_normal.txt", (45.0, 35.0, 52.0), 4.0
@@ -25,15 +26,15 @@ Progress = Callable[[float], None]
 
 
 class Recordings:
-    """Opens recordings and remembers which ones it made."""
+    """Opens recordings, and records which ones it has made."""
 
     def __init__(self, data_dir: Path) -> None:
-        """`data_dir` holds what is not simulated here: meshes, trajectories, real sequences."""
+        """`data_dir` contains the data that is not simulated: meshes, trajectories, real sequences."""
         self._data_dir = data_dir
         self._made: dict[Recording, Path] = {}
 
     def open(self, recording: Recording, progress: Progress) -> EventDepthSequence:
-        """Return a recording, simulating it when it is not there yet; Taichi must have been started."""
+        """Return a recording, simulating it if it does not exist yet; Taichi must have been started."""
         if recording.scene == REAL_SCENE:
             return RpgSequence(self._found(Path(REAL_SCENE)))
         is_mesh = recording.scene == MESH_SCENE
@@ -53,7 +54,7 @@ class Recordings:
         return EventReplicaSequence(folder)
 
     def discard(self, recording: Recording) -> None:
-        """Delete a recording that was made here; those that were there before stay."""
+        """Delete a recording that this object has made; others stay."""
         folder = self._made.pop(recording, None)
         if folder is not None:
             shutil.rmtree(folder)

@@ -1,4 +1,4 @@
-"""Results become one JSON file, Markdown tables and pictures."""
+"""Writes results as one JSON file, Markdown tables and pictures."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ Result = dict[str, Any]
 
 
 def write_report(results: Sequence[Result], out: Path, title: str) -> Path:
-    """Write results.json, tracking.md, ate.png and (where a long case ran) drift.png; return the table."""
+    """Write results.json, tracking.md, ate.png and (if a long case ran) drift.png; return the table."""
     out.mkdir(parents=True, exist_ok=True)
     with atomic_file(out / "results.json") as temporary:
         temporary.write_text(json.dumps(list(results), indent=1) + "\n")
@@ -43,7 +43,7 @@ def write_report(results: Sequence[Result], out: Path, title: str) -> Path:
 
 
 def markdown(results: Sequence[Result], title: str) -> str:
-    """Return the tables: one row per group and depth, then one per scene; mean / worst over the seeds."""
+    """Return the tables: one row per group and depth, then one row per case; mean / worst over the seeds."""
     variants = _variants(results)
     lines = [
         f"# {title}",
@@ -66,7 +66,7 @@ def markdown(results: Sequence[Result], title: str) -> str:
 
 
 def insert_into(document: Path, name: str, text: str) -> None:
-    """Replace what a Markdown document holds between `<!-- NAME -->` and `<!-- end NAME -->`."""
+    """Replace the text between `<!-- NAME -->` and `<!-- end NAME -->` in a Markdown document."""
     new = inserted(document.read_text(), name, text, document)
     with atomic_file(document) as temporary:
         temporary.write_text(new)
@@ -97,7 +97,7 @@ def _table(results: Sequence[Result], variants: list[str], row_of: Callable[[Res
 
 
 def _cell(results: Sequence[Result]) -> str:
-    """Return mean / worst ATE, lost frames when there are any, and how many runs have no result."""
+    """Return mean / worst ATE, and the numbers of lost frames and of runs without result if there are any."""
     errors = [r["ate_rmse_cm"] for r in results if "ate_rmse_cm" in r]
     if not errors:
         return "-"

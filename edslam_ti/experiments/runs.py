@@ -1,4 +1,4 @@
-"""Runs of methods over the cases, each result in a file of its own, so that a bench can be continued."""
+"""Runs methods on the cases; each result has a file of its own, so that an interrupted run can continue."""
 
 import itertools
 import json
@@ -28,14 +28,14 @@ from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import true_poses_at
 
-Report = Callable[[str, float], None]  # what goes on, and the share of it that is done
+Report = Callable[[str, float], None]  # receives the present activity and the share of it that is done
 Value = TypeVar("Value")
-LONGEST_MESSAGE = 300  # characters; compilers tell long stories
+LONGEST_MESSAGE = 300  # characters; compilers write long messages
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A method with settings that differ from its preset; the name stands in the tables."""
+    """A method with settings that differ from its preset; tables show the name."""
 
     name: str
     method: str
@@ -43,7 +43,7 @@ class Variant:
 
 
 def methods_as_variants(methods: Sequence[str], mapping: bool) -> list[Variant]:
-    """Return methods at their presets, with or without mapping."""
+    """Return methods with their presets, with or without mapping."""
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise ConfigError(f"method: expected some of {', '.join(METHODS)}, got '{unknown[0]}'")
@@ -54,9 +54,9 @@ def methods_as_variants(methods: Sequence[str], mapping: bool) -> list[Variant]:
 def run_case(
     case: Case, variant: Variant, sequence: EventDepthSequence, threads: int, report: Callable[[float], None]
 ) -> dict[str, Any]:
-    """Return what a method made of a case: errors against the truth, lost frames, speed.
+    """Run a method on a case; return errors against the truth, lost frames, and speed.
 
-    Errors are of SE(3)-aligned positions, once over all frames and once over those with depth alone.
+    Errors are of SE(3)-aligned positions, over all frames and over frames with depth.
     """
     recording = case.recording
     config = Config(method=variant.method, scene=recording.scene, seed=recording.seed, threads=threads)
@@ -119,7 +119,7 @@ def _drift_cm(estimate: Trajectory, sequence: EventDepthSequence) -> np.ndarray:
 
 
 def result_file(out: Path, case: Case, variant: Variant) -> Path:
-    """Return where a result is kept."""
+    """Return the path of a result's file."""
     return out / "cases" / case.name / f"{variant.name}.json"
 
 
@@ -133,10 +133,10 @@ def run_all(
     fresh: bool = False,
     keep_recordings: bool = True,
 ) -> Iterator[dict[str, Any]]:
-    """Run what has no result in `out` yet and yield all results, in the order of cases and variants.
+    """Run all cases without a result in `out`; yield all results, in the order of cases and variants.
 
-    A case that fails is recorded with its `error`, one whose data or library is absent as `skipped`; the
-    rest go on, and the next call tries those again.
+    A case that fails is recorded with its `error`, a case whose data or library is missing as `skipped`. The
+    other cases still run, and the next call tries the failed and skipped ones again.
     """
     is_started = False
     with _progress(console) as bar:
@@ -151,7 +151,7 @@ def run_all(
                 file = result_file(out, case, variant)
                 result = None if fresh else _kept(file)
                 if result is None:
-                    if not is_started:  # tables alone need no kernels
+                    if not is_started:  # without a run no kernels are needed
                         kernels.init("cpu", threads=threads)
                         is_started = True
                     if opened is None:
@@ -186,7 +186,7 @@ def describe(result: dict[str, Any]) -> str:
 def _opened(
     recordings: Recordings, recording: Recording, report: Report
 ) -> EventDepthSequence | dict[str, Any]:
-    """Return a recording, or what keeps it from being read."""
+    """Return a recording, or the problem that prevented reading it."""
     what = f"simulating {recording.scene}"
     return _or_problem(lambda: recordings.open(recording, lambda share: report(what, share)))
 
@@ -194,7 +194,7 @@ def _opened(
 def _attempted(
     case: Case, variant: Variant, sequence: EventDepthSequence, threads: int, report: Report
 ) -> dict[str, Any]:
-    """Return the result of a run, or what ended it."""
+    """Return the result of a run, or the problem that ended it."""
 
     def run() -> dict[str, Any]:
         noise = case.depth if case.depth == "kinect" else "none"
@@ -219,7 +219,7 @@ def _about(case: Case, variant: Variant) -> dict[str, Any]:
 
 
 def _or_problem(action: Callable[[], Value]) -> Value | dict[str, Any]:
-    """Return what an action returns, or what ended it: a bench goes on whatever happens to one case."""
+    """Return an action's result, or the problem that ended it, so that other cases still run."""
     try:
         return action()
     except (FileNotFoundError, ModuleNotFoundError) as missing:
@@ -232,7 +232,7 @@ def _or_problem(action: Callable[[], Value]) -> Value | dict[str, Any]:
 
 
 def _kept(file: Path) -> dict[str, Any] | None:
-    """Return a result of an earlier call, unless it failed or was skipped."""
+    """Return the result of an earlier call; None: there is none, or it failed or was skipped."""
     if not file.is_file():
         return None
     result: dict[str, Any] = json.loads(file.read_text())

@@ -1,4 +1,4 @@
-"""Which cases of the tracking bench to run."""
+"""Options that select cases of the tracking benchmark."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
-"""Steps of a whole run timed beside alternatives, and how the kernels' cost grows with their input.
+"""Times steps of a whole run against alternatives, and the growth of the kernels' cost with their input.
 
-The kernels alone are timed in experiments/kernel_times.py; here are the steps that need a map or a sequence.
+experiments/kernel_times.py times the kernels alone; this file times the steps that need a map or a sequence.
 """
 
 import time
@@ -42,7 +42,7 @@ from edslam_ti.slam import Slam
 WARM_UP_FRAMES = 3
 MOTION = (0.01, 0.0, 0.005)  # metres between the two views of a mapping step
 EPSILON, BACKGROUND = 0.004, 0.5
-EVENT_FLOOR = 1e-3  # an interval without events must not divide by zero
+EVENT_FLOOR = 1e-3  # avoids division by zero for an interval without events
 
 
 def rows(
@@ -91,7 +91,7 @@ def event_loss(
 ) -> Tensor:
     """Return the paper's Eq. 12 squared and divided by the measured mean square.
 
-    The raw loss grows with motion and interval length; divided, every interval weighs alike.
+    The raw loss grows with motion and interval length; the division gives every interval the same weight.
     """
     return (predicted - measured).square().mean() / (measured.square().mean() + EVENT_FLOOR)
 
@@ -99,7 +99,7 @@ def event_loss(
 def mapping_step(size: tuple[int, int], count: int, watch: Stopwatch) -> Iterator[Row]:
     """The paper's step: two views, event loss (Eq. 10-12), gradients of the map and of both poses, Adam.
 
-    The mapper compares one view (losses.py), which costs half of it.
+    The mapper compares one view (mapping/losses.py), which costs half as much.
     """
     (means, quats, scales, _, colors, pose), intrinsics = room_scene(count, *size)
     camera = Camera(*size, *intrinsics)
@@ -164,9 +164,9 @@ COMPARED: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def slam(scene: str, duration: float) -> Iterator[Row]:
-    """Frames of a sequence through several methods in turn: tracking alone, and ours with its mapping.
+    """Time the frames of a sequence with several methods in turn: tracking alone, and `ed_slam` with mapping.
 
-    Means over the frames, because some cost more than others.
+    Results are means over the frames, because some cost more than others.
     """
     base = Config(scene=scene, duration=duration)
     sequence = open_sequence(base)
@@ -203,7 +203,7 @@ def _timed(run: Slam, sample: Sample) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Curve:
-    """Cost of one task against one size; `exponent` fits cost ~ size^exponent."""
+    """Cost of one task as a function of one size; `exponent` fits cost ~ size^exponent."""
 
     task: str
     against: str  # "pixels", "Gaussians", "events" or "threads"
@@ -213,7 +213,7 @@ class Curve:
 
     @property
     def exponent(self) -> float:
-        """Slope of a line through the logarithms, of wall time against threads and else of CPU time."""
+        """Slope of a line through the logarithms: of wall time for threads, else of CPU time."""
         cost = self.wall_ms if self.against == "threads" else self.cpu_ms
         return float(np.polyfit(np.log(self.sizes), np.log(cost), 1)[0])
 
@@ -225,7 +225,7 @@ def scaling(
     threads: Sequence[int],
     watch: Stopwatch,
 ) -> Iterator[Curve]:
-    """Yield the kernels' cost against each size, the others at their middle; leaves the last threads."""
+    """Yield the kernels' cost against each size, others at their middle; changes the number of threads."""
     size, count, batch = sizes[len(sizes) // 2], gaussians[len(gaussians) // 2], events[len(events) // 2]
 
     def curves(against: str, values: Sequence[float], rows: Callable[[int], list[Row]]) -> Iterator[Curve]:

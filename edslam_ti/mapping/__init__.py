@@ -1,1 +1,1 @@
-"""The Gaussian map from events, depth and poses (Sec. III-C to III-E)."""
+"""Builds the Gaussian map from events, depth and poses (Sec. III-C to III-E)."""

@@ -1,4 +1,4 @@
-"""Limits of mapping: seconds of computing, the number of Gaussians, and which of them have faded."""
+"""Limits of mapping: computing time, number of Gaussians, and removal of Gaussians that have faded."""
 
 import math
 import time
@@ -8,11 +8,11 @@ from edslam_ti.mapping.gaussians import GaussianMap
 
 
 class Budget:
-    """Seconds of computing that mapping may take, growing with the seconds of data added."""
+    """Seconds of computing that mapping may take; the budget grows with the seconds of data added."""
 
     def __init__(
         self,
-        seconds_per_second: float | None,  # of computing, of data; None: no limit
+        seconds_per_second: float | None,  # computing time per second of data; None: no limit
         clock: Callable[[], float] = time.perf_counter,  # seconds
     ) -> None:
         self.spent = 0.0  # seconds
@@ -22,7 +22,7 @@ class Budget:
         self._started: float | None = None  # None: not counting
 
     def start(self, timestamp: float | None = None) -> None:
-        """Begin to count, with data up to a time stamp."""
+        """Begin to count; `timestamp`: the data now reaches this far."""
         self._started = self._clock()
         if timestamp is not None:
             self._first = timestamp if math.isnan(self._first) else self._first
@@ -33,7 +33,7 @@ class Budget:
         self.spent, self._started = self._now(), None
 
     def left(self, share: float = 1.0) -> float:
-        """Return how many seconds are left of a share of all that the data so far allows; below 0: none."""
+        """Return how many seconds are left of this share of the budget so far; negative: overspent."""
         if self._rate is None:
             return math.inf
         return share * self._rate * (self._last - self._first) - self._now()
@@ -44,18 +44,18 @@ class Budget:
 
 def stride_for_budget(
     stride: int,  # pixels, in an empty map
-    fullness: float,  # share of the largest number of Gaussians that there is
+    fullness: float,  # number of Gaussians divided by the largest number allowed
 ) -> int:
-    """Return the spacing of new Gaussians: beyond half of the largest number, the fuller the coarser.
+    """Return the spacing of new Gaussians, which grows once the map is more than half full.
 
-    A map that is full could not show new surfaces at all.
+    A full map could not show new surfaces at all.
     """
     remaining = min(1.0, 2 * (1 - fullness))
     return math.ceil(stride / math.sqrt(max(remaining, 1e-3)))
 
 
 def prune_faded(gaussians: GaussianMap, min_opacity: float) -> None:
-    """Remove the Gaussians whose opacity is not above the least one."""
+    """Remove the Gaussians whose opacity is at most `min_opacity`."""
     keep = gaussians.raw["logit_opacities"].detach().sigmoid() > min_opacity
     if not bool(keep.all()):
         gaussians.keep(keep)

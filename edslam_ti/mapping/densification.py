@@ -1,7 +1,8 @@
-"""More Gaussians where images ask for them: clone, split, prune, opacity reset (Kerbl et al. 2023, Sec. 5.2).
+"""Adaptive density control: clone, split, prune, reset opacities (Kerbl et al. 2023, Sec. 5.2).
 
-Thresholds are those of gsplat's DefaultStrategy, gradients in its units (half an image width). It starts from
-sparse points, whereas depth puts a Gaussian at every second pixel here (Eq. 13), so that this is optional.
+Thresholds are those of gsplat's DefaultStrategy; gradients have its units (half an image width).
+gsplat starts from sparse points. Here depth already puts a Gaussian at every second pixel (Eq. 13), so
+densification is optional.
 """
 
 import numpy as np
@@ -13,9 +14,9 @@ from edslam_ti.geometry import inverse
 from edslam_ti.mapping.gaussians import GaussianMap
 
 SMALL = 0.01  # of the scene's size: larger Gaussians are split, smaller ones cloned (gsplat: grow_scale3d)
-LARGE = 0.1  # of the scene's size: beyond, a Gaussian is pruned (gsplat: prune_scale3d)
-SHRINKING = 1.6  # by which the halves of a split Gaussian are smaller
-FAINTEST = 0.005  # opacity; opacities are reset to twice as much (gsplat: prune_opa)
+LARGE = 0.1  # of the scene's size: larger Gaussians are pruned (gsplat: prune_scale3d)
+SHRINKING = 1.6  # scales of a split Gaussian are divided by this
+FAINTEST = 0.005  # opacity; opacities are reset to twice this value (gsplat: prune_opa)
 
 
 def scene_size(gaussians: GaussianMap, positions: np.ndarray) -> float:  # [F, 3] of the camera, metres
@@ -25,13 +26,13 @@ def scene_size(gaussians: GaussianMap, positions: np.ndarray) -> float:  # [F, 3
 
 
 class Densifier:
-    """Adds up how strongly images pull at every Gaussian, and refines the map accordingly."""
+    """Sums every Gaussian's gradient in the image, and clones, splits and prunes accordingly."""
 
     def __init__(self, camera: Camera, size: float, min_gradient: float, most: int, seed: int) -> None:
-        """Start with nothing seen.
+        """Start with no gradients observed.
 
-        `size` of the scene in metres; `min_gradient`: mean pull from which on one Gaussian becomes two;
-        `most`: Gaussians that the map may hold.
+        `size`: of the scene, metres. `min_gradient`: a Gaussian whose mean gradient exceeds this becomes two.
+        `most`: the largest number of Gaussians.
         """
         self._camera = camera
         self._size = size
@@ -39,7 +40,7 @@ class Densifier:
         self._most = most
         self._generator = torch.Generator().manual_seed(seed)
         self._pull = torch.zeros(0)  # [N] sum of gradients
-        self._count = torch.zeros(0)  # [N] views that they are from
+        self._count = torch.zeros(0)  # [N] number of views summed
 
     @torch.no_grad()
     def observe(
@@ -47,16 +48,16 @@ class Densifier:
         num_gaussians: int,
         chosen: Tensor,  # [M] indices of the Gaussians in view
         means: Tensor,  # [M, 3] metres, world
-        gradient: Tensor,  # [M, 3] of the loss in the means
+        gradient: Tensor,  # [M, 3] of the loss with respect to the means
         T_world_camera: Tensor,  # [4, 4]
     ) -> None:
-        """Add one view's gradients; the number of Gaussians may have changed only by `refine`."""
+        """Add one view's gradients; between calls, only `refine` may change the number of Gaussians."""
         if len(self._pull) != num_gaussians:
             self._pull, self._count = torch.zeros(num_gaussians), torch.zeros(num_gaussians)
         T = inverse(T_world_camera.detach()).float()
         p, g = means @ T[:3, :3].T + T[:3, 3], gradient @ T[:3, :3].T
         ray = p / p.norm(dim=1, keepdim=True)
-        across = g - (g * ray).sum(1, keepdim=True) * ray  # moves it in the image, p = z / f pixels
+        across = g - (g * ray).sum(1, keepdim=True) * ray  # moves the mean in the image: z / f metres a pixel
         pixels = across.norm(dim=1) * p[:, 2] / self._camera.fx
         is_drawn = pixels > 0
         self._pull.index_add_(0, chosen, pixels * self._camera.width / 2)
@@ -64,7 +65,7 @@ class Densifier:
 
     @torch.no_grad()
     def refine(self, gaussians: GaussianMap) -> None:
-        """Clone small and split large Gaussians that are pulled at, prune faint and huge ones; begin anew."""
+        """Clone small and split large Gaussians with a strong gradient, prune faint and huge ones."""
         is_pulled = self._pull / self._count.clamp_min(1) > self._min_gradient
         largest = gaussians.raw["log_scales"].amax(1).exp()
         is_small = largest <= SMALL * self._size
@@ -81,7 +82,7 @@ class Densifier:
         self._pull, self._count = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
 
     def _split(self, gaussians: GaussianMap, chosen: Tensor) -> None:
-        """Replace each by two smaller ones, drawn from it."""
+        """Replace each chosen Gaussian by two smaller ones whose means are drawn from it."""
         both = torch.cat([chosen, gaussians.clone(chosen)])
         raw = {name: gaussians.raw[name][both] for name in ("means", "quats", "log_scales")}
         within = raw["log_scales"].exp() * torch.randn(len(both), 3, generator=self._generator)
@@ -90,7 +91,7 @@ class Densifier:
 
     @torch.no_grad()
     def reset_opacities(self, gaussians: GaussianMap) -> None:
-        """Make all Gaussians faint: those that images need come back, floaters do not."""
+        """Make all Gaussians faint; optimisation restores those that images need, but not floaters."""
         everyone = torch.arange(len(gaussians))
         faint = torch.tensor(2 * FAINTEST).logit()
         gaussians.overwrite("logit_opacities", everyone, gaussians.raw["logit_opacities"].clamp_max(faint))

@@ -1,4 +1,4 @@
-"""Building the Gaussian map from events and depth, poses refined with it (Sec. III-C to III-E)."""
+"""Builds the Gaussian map from events and depth, and refines poses with it (Sec. III-C to III-E)."""
 
 import math
 from collections.abc import Iterator
@@ -28,14 +28,14 @@ from edslam_ti.mapping.rendering import RenderOutput, View, drawable, render_map
 from edslam_ti.mapping.targets import EventImages, FrameSampler, evenly
 from edslam_ti.trajectory import Trajectory
 
-ONLINE_SHARE = 0.5  # of the budget, for the steps while the map grows
-ADJUST_FROM = 0.3  # fraction of the final steps after which poses are adjusted, too
-ALIGN_FROM = 0.5  # fraction of them after which frames without depth are aligned to the map, once
-LAST_RATE = 0.05  # of the learning rates, to which they fall during the final steps
+ONLINE_SHARE = 0.5  # share of the budget for the steps during the run
+ADJUST_FROM = 0.3  # fraction of the final steps after which poses are optimised, too
+ALIGN_FROM = 0.5  # fraction of the final steps after which frames without depth are aligned to the map, once
+LAST_RATE = 0.05  # learning rates fall to this share of their values during the final steps
 WHITE_LEVEL = 0.93  # brightness given to the brightest percent of pixels
-SOLVE_EVERY = 5  # frames between solutions of the start image
-MAX_RECOLOURED = 8  # frames looked at for the brightness that such a solution gives Gaussians
-SETTLING = (0.002, 0.1)  # metres, degrees: poses that change by less are only being refined
+SOLVE_EVERY = 5  # frames between two solves of the start image
+MAX_RECOLOURED = 8  # after each solve, Gaussians are recoloured from at most this many frames
+SETTLING = (0.002, 0.1)  # metres, degrees: the map does not follow smaller changes of poses
 
 
 @dataclass
@@ -50,12 +50,12 @@ class Refinement:
 
 
 class GaussianMapper:
-    """Gaussians from depth, optimised with the poses for what events say has changed since the beginning.
+    """Places Gaussians at measured depth and optimises them, and the poses, to explain the events.
 
-    Eq. 10 to 12 with t_k at the beginning of a window of some seconds. The image there is unknown but the
-    same for all frames of the window: it is solved (event_images/solve.py). A step then compares a single
-    view with that image plus the change. Grey images, where given, are such views themselves and tell what
-    the start is.
+    Eq. 10 to 12 with t_k at the beginning of a window of some seconds. The image at t_k is unknown but the
+    same for all frames of the window, so it is solved once (event_images/solve.py). A step then compares a
+    single view with that image plus the change since t_k. Grey images, where given, serve as such views and
+    fix the image at t_k.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class GaussianMapper:
         self._built_on = PoseMemory()
         self._refinement: Refinement | None = None  # None: not refining
         self._num_frames = 0
-        self._num_supervised = 0  # frames that the map has been optimised for, dropped ones too
+        self._num_supervised = 0  # frames that the map has been optimised for, including dropped ones
 
     @property
     def num_gaussians(self) -> int:
@@ -128,7 +128,7 @@ class GaussianMapper:
         return Refinement(allowed, densifier, is_aligned=not self._adjusts_poses)
 
     def _optimise_online(self, trajectory: Trajectory) -> None:
-        """Solve the start image now and then, and take a few steps, half of them on the newest frames."""
+        """Solve the start image every few frames, and take some steps, half of them on the newest frames."""
         self._num_supervised += 1
         count = self._num_supervised
         if count % SOLVE_EVERY == 0 or (count < SOLVE_EVERY and not self.images.is_solved):
@@ -137,7 +137,7 @@ class GaussianMapper:
             for _ in range(self._config.iterations):
                 if self.budget.left(ONLINE_SHARE) <= 0:
                     break
-                # A young map's errors would pull the poses along: they are adjusted to the finished one.
+                # Errors of the unfinished map would spoil the poses; `finish` optimises them.
                 index = self._sampler.recent(self.images.frames)
                 difference = self._optimise(index, trajectory, adjusts_poses=False)
                 if difference is not None:
@@ -192,7 +192,7 @@ class GaussianMapper:
         return [keyframe.index for keyframe in self.keyframes]
 
     def metrics(self) -> dict[str, int | float | None]:
-        """Return the numbers of keyframes, of steps taken, and of pixels that fire by themselves."""
+        """Return the numbers of keyframes, of optimisation steps, and of noisy pixels."""
         return {
             "num_keyframes": len(self.keyframes),
             "num_mapping_steps": self.num_steps,
@@ -218,9 +218,9 @@ class GaussianMapper:
     # --- growing ---
 
     def _move_with_corrected_poses(self, trajectory: Trajectory) -> None:
-        """Deform the map as the poses that it was built from have been corrected.
+        """Move the Gaussians with the corrected poses of the frames that they came from.
 
-        Images from events belong to frames and need not be moved.
+        Event images belong to frames and need not be moved.
         """
         corrections = self._built_on.corrections(trajectory)
         if any(not is_near(T, *SETTLING) for T in corrections.values()):
@@ -232,7 +232,7 @@ class GaussianMapper:
         index: int,  # of its frame
         trajectory: Trajectory,
     ) -> None:
-        """Add Gaussians where the map does not show the frame's depth; make it a keyframe if much is new."""
+        """Add Gaussians where the map lacks the frame's depth; add a keyframe if it sees enough new."""
         T, config = trajectory.pose(index), self._config
         view = self._view(T)
         if not self.keyframes or self._sees_enough_new(view, depth, index, trajectory):
@@ -281,7 +281,7 @@ class GaussianMapper:
     # --- optimising ---
 
     def _solve_brightness(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
-        """Solve the start image and give the Gaussians its brightness; return whether it could be solved."""
+        """Solve the start image and recolour the Gaussians; return whether the solve succeeded."""
         was_solved, epsilon = self.images.is_solved, self._config.log_epsilon
         newest = evenly(self.images.newest_frames, MAX_RECOLOURED)
         changed = self.images.frames if is_thorough or not was_solved else newest
@@ -307,14 +307,14 @@ class GaussianMapper:
         adjusts_poses: bool,
         densifier: Densifier | None = None,
     ) -> np.ndarray | None:  # [H, W]
-        """Take one step of Eq. 16 on one frame, the map's and the pose's; tell the densifier about it.
+        """Take one step of Eq. 16 on one frame, for map and pose; the densifier observes the gradients.
 
-        Return log brightness of the map less that of the image, None where the map is out of view.
+        Return the map's log brightness minus the image's; None if the view shows no Gaussian.
         """
         self.num_steps += 1
         pose = StepPose(trajectory, index, adjusts_poses)
         T = pose.T_world_camera
-        # What is out of view costs nothing, however large the map.
+        # Only Gaussians in view cost time, however large the map.
         chosen = drawable(self.gaussians, self._camera, T)
         if len(chosen) == 0:
             return None

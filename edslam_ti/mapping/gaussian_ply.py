@@ -94,6 +94,6 @@ def read_gaussian_ply(path: Path) -> dict[str, np.ndarray]:
 
 
 def three_channels(colors: np.ndarray) -> np.ndarray:  # [N], [N, 1] or [N, 3] -> [N, 3]
-    """Return grey three times, colours as they are."""
+    """Return colours unchanged; repeat grey in three channels."""
     columns = colors.reshape(len(colors), -1)
     return np.repeat(columns, 3, axis=1) if columns.shape[1] == 1 else columns

@@ -40,7 +40,7 @@ class Moments(NamedTuple):
 
     @classmethod
     def zeros_like(cls, value: Tensor) -> Self:
-        """Return those before the first step."""
+        """Return the moments before the first step."""
         return cls(torch.zeros_like(value), torch.zeros_like(value))
 
 
@@ -49,8 +49,8 @@ class GaussianMap:
     log_scales [N, 3], logit_opacities [N], logit_colors [N, 1] (brightness in (0, 1) behind a sigmoid).
 
     A Gaussian's brightness logit is its own plus those of the cells it lies in, at several cell sizes.
-    Events tie brightness together only across edges, so that one Gaussian at a time a large surface
-    takes thousands of steps to find its level; cells let it move as one.
+    Events constrain brightness only across edges. If each Gaussian moved alone, a large surface would take
+    thousands of steps to reach its level; with cells it moves as one.
     """
 
     def __init__(self, config: MappingConfig) -> None:
@@ -66,8 +66,8 @@ class GaussianMap:
         self._raw = {name: value.requires_grad_() for name, value in empty.items()}
         self._moments = {name: Moments.zeros_like(value) for name, value in empty.items()}
         self._steps = 0
-        self._frames = torch.empty(0, dtype=torch.int64)  # [N] whose depth each is from
-        self._is_measured = torch.empty(0, dtype=torch.bool)  # [N] that depth was not assumed
+        self._frames = torch.empty(0, dtype=torch.int64)  # [N] frame whose depth the Gaussian is from
+        self._is_measured = torch.empty(0, dtype=torch.bool)  # [N] its depth was measured, not assumed
         self._cell_sizes = torch.tensor(config.brightness_cells)
         self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
         self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
@@ -83,7 +83,7 @@ class GaussianMap:
         return self._raw
 
     def activated(self, chosen: Tensor | None = None) -> Gaussians:  # [M] indices; None: all
-        """Return what is rendered, differentiable in the raw parameters; compute it once a step."""
+        """Return the parameters to render, differentiable in the raw ones; compute them once per step."""
         # index_select adds its gradients up in order; indexing does it in parallel, differently every run
         raw, cells = self._raw, self._cells
         if chosen is not None:
@@ -99,9 +99,9 @@ class GaussianMap:
         )
 
     def subset(self, chosen: Tensor) -> "GaussianMap":  # [M] indices
-        """Return some of the Gaussians as a map of their own, to be optimised at their cost alone.
+        """Return the chosen Gaussians as a separate map, so that a step costs no more than they do.
 
-        `update_from` brings back what has become of them. The cells are shared with it from the beginning.
+        `update_from` copies the optimised values back. Both maps share the cells.
         """
         subset = copy.copy(self)
         subset._map_rows(lambda table: table.index_select(0, chosen))
@@ -129,7 +129,7 @@ class GaussianMap:
         opacity: float,
         colors: Tensor,  # [M, 1] in (0, 1)
         frame: int = 0,  # whose depth they are from
-        is_measured: Tensor | None = None,  # [M] bool: that depth was not assumed; None: all
+        is_measured: Tensor | None = None,  # [M] bool: depth was measured, not assumed; None: all
     ) -> None:
         """Append Gaussians; their optimiser moments start at zero."""
         m = len(means)
@@ -149,7 +149,7 @@ class GaussianMap:
         self._append(new)
 
     def clone(self, chosen: Tensor) -> Tensor:  # [M] indices -> [M] indices
-        """Append copies of some Gaussians, moments at zero; return where they are."""
+        """Append copies of some Gaussians, moments at zero; return the copies' indices."""
         n = len(self)
         self._cells = torch.cat([self._cells, self._cells[chosen]])
         self._frames = torch.cat([self._frames, self._frames[chosen]])
@@ -158,7 +158,7 @@ class GaussianMap:
         return torch.arange(n, len(self))
 
     def overwrite(self, name: str, chosen: Tensor, values: Tensor) -> None:  # [M] indices, [M, ...]
-        """Set a raw parameter of some Gaussians; its moments begin anew."""
+        """Set a raw parameter of some Gaussians and reset its moments."""
         self._raw[name].detach()[chosen] = values.detach()
         for moment in self._moments[name]:
             moment[chosen] = 0
@@ -169,7 +169,7 @@ class GaussianMap:
 
     @torch.no_grad()
     def move_with_frames(self, corrections: Mapping[int, np.ndarray]) -> None:  # T_new T_old^-1 by frame
-        """Move the Gaussians from every frame's depth as its pose has been moved."""
+        """Move each Gaussian with the pose of the frame whose depth it is from."""
         frames = torch.tensor(sorted(corrections), dtype=torch.int64)
         chosen = torch.nonzero(torch.isin(self._frames, frames)).squeeze(1)
         if len(chosen) == 0:
@@ -227,7 +227,7 @@ class GaussianMap:
             )
 
     def _map_rows(self, change: Callable[[Tensor], Tensor]) -> None:
-        """Replace every table of one row a Gaussian."""
+        """Replace every table that has one row per Gaussian."""
         self._cells, self._frames = change(self._cells), change(self._frames)
         self._is_measured = change(self._is_measured)
         self._raw = {name: change(value.detach()).requires_grad_() for name, value in self._raw.items()}
@@ -235,5 +235,5 @@ class GaussianMap:
 
 
 def _logit(colors: Tensor) -> Tensor:
-    """Return the logit of brightness, at the ends of its range as far as gradients can come back from."""
+    """Return the logit of brightness, clamped where gradients would vanish."""
     return colors.clamp(0.002, 0.998).logit()

@@ -1,4 +1,4 @@
-"""New Gaussians: where depth asks for them (Eq. 13), and discs on the surfaces that it measures."""
+"""New Gaussians: where Eq. 13 places them, and their shape, discs on the measured surface."""
 
 from dataclasses import dataclass
 
@@ -12,36 +12,36 @@ from edslam_ti.geometry import inverse
 from edslam_ti.mapping.budget import stride_for_budget
 from edslam_ti.open3d_loader import load_open3d
 
-FINER = 2  # times closer are new Gaussians at outlines, where a coarse one would show on both sides
+FINER = 2  # near depth edges new Gaussians are this many times closer: coarse ones would show on both sides
 FLATNESS = 0.2  # thickness of a new Gaussian, as a share of its width
-MAX_ELONGATION = 4.0  # of a new Gaussian on a surface that falls away
+MAX_ELONGATION = 4.0  # length over width of a new Gaussian on a slanted surface
 FARTHEST = 1e4  # metres; larger readings are errors of the file, not distances
 
 
 @dataclass(frozen=True)
 class NewGaussians:
-    """Where Gaussians are to be added, and what they look like but for their brightness."""
+    """Gaussians to be added, without their brightness."""
 
     means: np.ndarray  # [N, 3] float32 metres, world
     pixels: np.ndarray  # [N, 2] int64 (x, y) that they are from
     quats: np.ndarray  # [N, 4] float32 wxyz
     scales: np.ndarray  # [N, 3] float32 metres
-    is_measured: np.ndarray  # [N] bool: at measured depth, not at that assumed in a hole
+    is_measured: np.ndarray  # [N] bool: at measured depth, not at depth assumed in a hole
 
 
 def new_gaussians(
     depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
-    alpha: np.ndarray,  # [H, W] of the map seen from there
+    alpha: np.ndarray,  # [H, W] of the map rendered from this pose
     rendered_depth: np.ndarray,  # [H, W] metres, of that view
     camera: Camera,
     T_world_camera: np.ndarray,  # [4, 4]
     count: int,  # Gaussians in the map so far
     config: MappingConfig,
 ) -> NewGaussians | None:
-    """Return Gaussians at the pixels that Eq. 13 selects, one per stride x stride block, closer at outlines.
+    """Return Gaussians at the pixels that Eq. 13 selects, one per stride x stride block, closer at edges.
 
-    So do pixels without depth get one where the map shows nothing, at the depth that is assumed there. None:
-    there is nothing to add, or no more may be added.
+    Pixels without depth get Gaussians at an assumed depth where the map shows nothing. None: there is nothing
+    to add, or the map is full.
     """
     mask = densify_mask(alpha, rendered_depth, depth, config.min_visibility, config.depth_error_factor)
     mask |= (depth <= 0) & (alpha < config.min_visibility)
@@ -54,7 +54,7 @@ def new_gaussians(
     if len(points) == 0:
         return None
     x, y = pixels[:, 0], pixels[:, 1]
-    # Discs on the surface; small ones sharpen faster than large ones shrink, and Eq. 13 fills the gaps.
+    # Discs start small: growing is faster than shrinking, and Eq. 13 fills the gaps between them.
     size = config.initial_size * spacing[y, x] * depth[y, x] / camera.fx
     quats, elongation = surface_discs(depth, camera, T_world_camera, pixels, MAX_ELONGATION)
     scales = size[:, None] * np.stack([np.ones_like(size), elongation, np.full_like(size, FLATNESS)], 1)
@@ -82,7 +82,7 @@ def densify_mask(
 def spaced(
     spacing: np.ndarray,  # [H, W] int, pixels
 ) -> np.ndarray:  # [H, W] bool
-    """Return one pixel of every block that is as wide and high as the spacing."""
+    """Return one pixel of every block of spacing x spacing pixels."""
     y, x = np.ogrid[: spacing.shape[0], : spacing.shape[1]]
     return (y % spacing == spacing // 2) & (x % spacing == spacing // 2)
 
@@ -123,10 +123,10 @@ def surface_discs(
     pixels: np.ndarray,  # [N, 2] int64 (x, y)
     max_elongation: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # [N, 4] float32 wxyz; [N] float32 >= 1
-    """Return the orientation of discs that lie on the surface, and how much longer than wide they must be.
+    """Return the orientation and elongation of discs that lie on the surface and look circular.
 
-    The third axis is the normal; a disc seen as a circle is longer by the elongation, 1 / cosine of the tilt,
-    along the second axis. Where depth is missing beside a pixel, or jumps, the disc faces the camera.
+    The third axis is the normal. The disc is longer along the second axis, by 1 / cosine of the tilt. Where a
+    neighbour's depth is missing or jumps, the disc faces the camera.
     """
     from scipy.spatial.transform import Rotation
 
@@ -153,7 +153,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:  # [N, 3]
 
 
 def _differences(points: np.ndarray, depth: np.ndarray, axis: int) -> np.ndarray:  # [H, W, 3]
-    """Return the difference of the points beside each, 0 at the rim and where depth is missing or jumps."""
+    """Return the difference of each point's two neighbours; 0 at the border and where depth ends or jumps."""
     result = np.zeros_like(points)
     inner, before, after = ([slice(None), slice(None)] for _ in range(3))
     inner[axis], before[axis], after[axis] = slice(1, -1), slice(None, -2), slice(2, None)

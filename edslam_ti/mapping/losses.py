@@ -1,8 +1,8 @@
-"""What the map is optimised for: brightness, depth and the shape of its Gaussians (Eq. 12, 14, 15, 16).
+"""Loss of the map: brightness, depth and the shape of Gaussians (Eq. 12, 14, 15, 16).
 
 The paper compares two renders with the change of brightness measured between them (Eq. 10 to 12). Here the
-image at the beginning of that change is known (event_images/solve.py), so that one render is compared with
-that image plus the change: the same residual with one of its two views put in.
+image at the start of that change is known (event_images/solve.py), so one render is compared with that image
+plus the change. This is the same residual with the first view replaced by a known image.
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from edslam_ti.geometry import inverse
 from edslam_ti.kernels.view_losses import Comparison, compare_view
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
 
-# Squared log brightness, by which the mean square of Eq. 12 is divided: the event loss of a map of one
-# brightness is then in the order of 1. With lambda_event = 1 the bare mean square thus weighs 10 times.
+# Squared log brightness by which the mean square of Eq. 12 is divided, so that the event loss of a map of
+# uniform brightness is of the order of 1. At lambda_event = 1 the mean square itself has weight 10.
 BRIGHTNESS_VARIANCE = 0.1
 
 
@@ -27,7 +27,7 @@ class MapLoss:
 
     total: Tensor  # differentiable in the map and the pose
     event: float  # Eq. 12 divided by BRIGHTNESS_VARIANCE, unweighted
-    difference: np.ndarray  # [H, W] log brightness of the map less that of the image
+    difference: np.ndarray  # [H, W] log brightness of the map minus that of the image
 
 
 def map_loss(
@@ -62,11 +62,11 @@ def view_loss(
     epsilon: float,
     weights: tuple[float, float],  # of Eq. 12 and of Eq. 15
 ) -> Comparison:
-    """Return how much a view differs in brightness (Eq. 12) and depth (Eq. 15), with gradients in one pass.
+    """Return a view's brightness loss (Eq. 12) and depth loss (Eq. 15), with gradients in one pass.
 
     Eq. 12 is the mean over all pixels of the squared difference of log brightness. Eq. 15 is the mean over
-    pixels with depth of |rendered - alpha * measured|, the rendered depth being weighted by alpha (Eq. 8).
-    Not |rendered - measured|: 1 % of transparency, 3 m away, would count as 3 cm and pull every surface back.
+    pixels with depth of |rendered - alpha * measured|, because rendered depth is weighted by alpha (Eq. 8).
+    With |rendered - measured|, 1 % of transparency at 3 m would count as 3 cm and pull every surface back.
     """
     if depth is None or weights[1] == 0:
         depth = zeros_like(log_brightness)
@@ -83,6 +83,6 @@ def scale_loss(
     log_scales: Tensor,  # [G, 3]
     max_ratio: float,  # r
 ) -> Tensor:
-    """Return how much longer than r times their thickness Gaussians are on average, Eq. 14."""
+    """Return by how much, on average, the length of Gaussians exceeds r times their thickness, Eq. 14."""
     ratio = (log_scales.amax(-1) - log_scales.amin(-1)).exp()
     return (ratio.clamp_min(max_ratio) - max_ratio).mean()

@@ -1,4 +1,4 @@
-"""What a mapper is."""
+"""The interface of mappers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,18 +11,18 @@ from edslam_ti.frame import Frame
 from edslam_ti.mapping.rendering import View
 from edslam_ti.trajectory import Trajectory
 
-Progress = Callable[[float], bool]  # told the fraction done, 0 to 1; False asks to stop
+Progress = Callable[[float], bool]  # receives the fraction done, 0 to 1; returns False to stop
 
 
 class Mapper(Protocol):
-    """Builds a map from tracked frames and shows it. This is all that the rest of the package knows of it."""
+    """Builds a map from tracked frames and renders it. The rest of the package uses nothing else of it."""
 
     # --- during a run ---
 
     def update(self, frame: Frame, trajectory: Trajectory) -> None:
-        """Add the newest frame, whose pose ends the trajectory; may correct earlier poses.
+        """Add the newest frame, whose pose is the trajectory's last; may correct earlier poses.
 
-        The depth and the image of a frame with `is_held_out` must not be used.
+        It must not use the depth and the image of a frame with `is_held_out`.
         """
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
@@ -30,22 +30,22 @@ class Mapper(Protocol):
 
     @property
     def num_gaussians(self) -> int:
-        """Size of the map; 0 for maps of another kind."""
+        """Number of Gaussians; 0 for other kinds of maps."""
 
     @property
     def loss(self) -> float:
-        """Running mean of what is minimised; nan where nothing is."""
+        """Running mean of the loss; nan if the mapper minimises none."""
 
     # --- what the map shows ---
 
     def render(self, camera: Camera, T_world_camera: np.ndarray, measured_only: bool = False) -> View:
-        """Return the map seen from a pose [4, 4]; `measured_only`: without surfaces that are assumed."""
+        """Return the map seen from a pose [4, 4]; `measured_only`: without surfaces at assumed depth."""
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Return points [N, 3] (metres, world) and their brightness [N] in [0, 1]."""
 
     def keyframe_indices(self) -> list[int]:
-        """Return the frames that the map is built on, for viewers; empty for a map without keyframes."""
+        """Return the indices of keyframes, for viewers; empty for a map without keyframes."""
 
     # --- results ---
 
@@ -61,4 +61,4 @@ class Mapper(Protocol):
 
     @property
     def map(self) -> object:
-        """The object that holds the map itself, whose memory is reported apart from the mapper's."""
+        """The object that holds the map itself; its memory is reported separately from the mapper's."""

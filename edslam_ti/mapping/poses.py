@@ -1,9 +1,9 @@
-"""Poses and the map: corrected together with it, aligned to it, and followed by it (Sec. III-E).
+"""Refinement of poses with the map (Sec. III-E).
 
-Bundle adjustment by turns: poses descend with the map (`PoseRefiner`), and those of frames without depth are
-aligned to it once (`MapAligner`). Between depth images the tracker has one keyframe's brightness and a motion
-prior to go by. The map has seen the same surfaces in all frames: its errors are as large but independent, so
-half way between is better than either. Where a frame has depth, the tracker is the better of the two.
+Bundle adjustment has two parts: gradient steps on poses and map together (`PoseRefiner`), and one alignment
+of frames without depth to the map (`MapAligner`). Between depth images the tracker relies on one keyframe's
+brightness and a motion prior. The map combines all frames: its errors are as large but independent, so the
+pose half way between both is better than either. At frames with depth the tracker is better than the map.
 """
 
 from dataclasses import replace
@@ -22,25 +22,25 @@ from edslam_ti.mapping.rendering import render_map
 from edslam_ti.mapping.targets import EventImages
 from edslam_ti.trajectory import Trajectory
 
-OPAQUE = 0.9  # alpha from which a pixel of the map's view is a surface
-SPACING = 2  # pixels between those that are aligned, in either direction
+OPAQUE = 0.9  # a rendered pixel with at least this alpha shows a surface
+SPACING = 2  # every second pixel in either direction is aligned
 STEPS = 3  # of Levenberg-Marquardt: the pose is nearly right
-FARTHEST = (0.02, 2.0)  # metres, degrees: a larger correction is not believed
-SHARE = 0.5  # of a correction that is made: the tracker's errors and the map's are as large, and independent
+FARTHEST = (0.02, 2.0)  # metres, degrees: larger corrections are rejected
+SHARE = 0.5  # of each correction is applied: errors of tracker and map are equally large and independent
 
 
 class PoseMemory:
-    """The poses that a map has been built from, to be compared with corrected ones."""
+    """The poses that the map was built from, for comparison with corrected ones."""
 
     def __init__(self) -> None:
         self._poses = np.zeros((0, 4, 4))
 
     def remember(self, trajectory: Trajectory) -> None:
-        """Keep a copy of all poses as they are."""
+        """Keep a copy of all present poses."""
         self._poses = trajectory.poses
 
     def corrections(self, trajectory: Trajectory) -> dict[int, np.ndarray]:  # [4, 4] by frame
-        """Return by what poses differ from those remembered, T_new T_old^-1, of frames that do differ."""
+        """Return T_new T_old^-1 for the frames whose pose has changed since `remember`."""
         poses, old = trajectory.poses, self._poses
         differ = np.flatnonzero((poses[: len(old)] != old).any((1, 2)))
         return {int(k): poses[k] @ inverse(old[k]) for k in differ}
@@ -66,10 +66,10 @@ class PoseRefiner:
 
 
 class StepPose:
-    """A pose for one step of optimisation, T exp(delta) with delta = 0, along which it may descend."""
+    """A pose T exp(delta) with delta = 0, differentiable in delta, for one step of optimisation."""
 
     def __init__(self, trajectory: Trajectory, index: int, is_free: bool) -> None:
-        """`is_free`: to be optimised; the first frame never is, it is the gauge."""
+        """`is_free`: optimise the pose. The first frame's pose stays fixed: it defines the world frame."""
         self.index = index
         self.T_world_camera = torch.from_numpy(trajectory.pose(index))  # [4, 4]
         self._delta: Tensor | None = None
@@ -84,7 +84,7 @@ class StepPose:
 
 
 class MapAligner:
-    """Corrects poses by comparing images with what the map shows there."""
+    """Corrects poses by aligning images to renders of the map."""
 
     def __init__(self, camera: Camera, tracking: TrackingConfig, mapping: MappingConfig) -> None:
         self._camera = camera
@@ -92,7 +92,7 @@ class MapAligner:
         self._model = replace(residual_model(tracking, tracking.brightness_sigma), depth_weight=0.0)
 
     def align(self, trajectory: Trajectory, images: EventImages, gaussians: GaussianMap) -> None:
-        """Correct the poses of frames without depth by the map."""
+        """Correct the poses of frames without depth."""
         for k in images.frames:
             if images.depth(k) is None:
                 T = trajectory.pose(k)
@@ -104,12 +104,12 @@ class MapAligner:
     def corrected(
         self,
         image: np.ndarray,  # [H, W] log brightness
-        view: np.ndarray,  # [H, W] log brightness of the map, seen from the pose as it is
+        view: np.ndarray,  # [H, W] log brightness of the map, seen from the present pose
         depth: np.ndarray,  # [H, W] metres, of that view
         alpha: np.ndarray,  # [H, W] of that view
         T_world_camera: np.ndarray,  # [4, 4]
     ) -> np.ndarray:  # [4, 4]
-        """Return the pose half way to where the map looks like the image; as it is where that is in doubt."""
+        """Return the pose half way to the one aligned to the map; unchanged if that alignment is doubtful."""
         v, u = SPACING * np.stack(np.nonzero((alpha > OPAQUE)[::SPACING, ::SPACING]))
         if len(v) < MIN_PIXELS:
             return T_world_camera

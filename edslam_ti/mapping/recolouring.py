@@ -1,4 +1,4 @@
-"""Gaussians follow the brightness of images that have been solved anew."""
+"""Recolours Gaussians after event images have been solved again."""
 
 from collections.abc import Iterable
 
@@ -14,9 +14,9 @@ def recolour(
     is_complete: bool,  # the views are all there are
     epsilon: float,  # added to brightness before the logarithm
 ) -> None:
-    """Change every Gaussian's log brightness by the mean of what has been added where it is seen.
+    """Add to every Gaussian's log brightness the mean change of the images at the pixels that show it.
 
-    Gaussians that no view shows change as all others do on average, if the views are complete.
+    If the views are complete, Gaussians that no view shows get the mean change of all others.
     """
     n = len(gaussians)
     total, count = np.zeros(n), np.zeros(n)

@@ -12,7 +12,7 @@ from edslam_ti.kernels import culling
 from edslam_ti.kernels.rasterization import rasterize
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
 
-MIN_DRAWN = 1e-3  # alpha; below this there is no depth to speak of
+MIN_DRAWN = 1e-3  # alpha; below this a pixel has no depth
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class RenderOutput:
 
     @property
     def expected_depth(self) -> Tensor:
-        """Depth of what is drawn: Eq. 8's sum divided by alpha, 0 where nothing is drawn."""
+        """Expected depth: Eq. 8's sum divided by alpha, 0 where nothing is drawn."""
         depth = self.depth / self.alpha.clamp_min(MIN_DRAWN)
         return torch.where(self.alpha > MIN_DRAWN, depth, torch.zeros_like(depth))
 
 
 @dataclass(frozen=True)
 class View:
-    """A rendered view as plain arrays: what every method's mapper can show."""
+    """A rendered view as plain arrays, the same for all mappers."""
 
     intensity: np.ndarray  # [H, W] float32 brightness
     depth: np.ndarray  # [H, W] float32 metres, 0 = nothing drawn
@@ -81,13 +81,13 @@ def render_map(
     T_world_camera: np.ndarray,  # [4, 4]
     background: float,
 ) -> RenderOutput:
-    """Return the map seen from a pose, without gradients; what is out of view costs nothing."""
+    """Return the map seen from a pose, without gradients; only Gaussians in view cost time."""
     T = torch.from_numpy(T_world_camera)
     chosen = drawable(gaussians, camera, T)
     view = render(gaussians.activated(chosen), camera, T, background)
     visible = torch.zeros(len(gaussians), dtype=torch.bool)
     visible[chosen] = view.visible
-    # Indices of the subset to those of the map; -1, the last one here, stays -1.
+    # Translate indices of the subset into those of the map; -1 selects the last entry, which is -1.
     of_map = torch.cat([chosen, torch.tensor([-1])]).int()
     return replace(view, visible=visible, dominant=of_map[view.dominant.long()])
 
@@ -107,10 +107,10 @@ def median_depth(
     output: RenderOutput,
     T_world_camera: Tensor,  # [4, 4]
 ) -> Tensor:  # [H, W] metres, 0 = nothing drawn
-    """Return the depth of the Gaussian at which half of the light is gone, as in Huang et al. 2024 (2DGS).
+    """Return the depth of the Gaussian at which transmittance falls below half (Huang et al. 2024, 2DGS).
 
-    At an outline expected depth lies between two surfaces, where there is nothing. Where more than half of
-    the light passes, there is no median, and it is the expected depth.
+    At a depth edge expected depth lies between the two surfaces. Where transmittance stays above half, there
+    is no median, and expected depth is returned.
     """
     _, _, row, _ = inverse(T_world_camera).float()
     depth = gaussians.means @ row[:3] + row[3]

@@ -1,7 +1,7 @@
-"""What views of the map are compared with: a start image, and what events say has changed since (Eq. 11).
+"""Target images for views of the map: a start image plus the change measured by events since (Eq. 11).
 
-The start image is that of a window of a few seconds of events. Grey images, where given, are such images
-themselves and tell what the start image is.
+Every window of a few seconds of events has one start image. Grey images, where given, are targets themselves
+and fix the start image.
 """
 
 from dataclasses import dataclass, replace
@@ -21,16 +21,16 @@ from edslam_ti.frame import Frame
 from edslam_ti.trajectory import Trajectory
 
 MIN_VIEWS = 3  # frames needed before a start image can be solved
-QUICK = {4: 60}  # iterations of the solution by reduction of the images, during the run
+QUICK = {4: 60}  # solver iterations for each reduction of the images, during the run
 THOROUGH = {4: 100, 2: 80}  # the same at the end
 GIVEN_VIEWS = 6  # frames of earlier windows that a start image is tied to
-DETAIL_SIGMA = 4.0  # px; smaller details of the start image are learned from renders
-DETAIL_RATE = 0.1  # share of a render's difference by which they move
+DETAIL_SIGMA = 4.0  # px; details smaller than this are learned from renders
+DETAIL_RATE = 0.1  # share of a render's difference that is added to the start image
 
 
 @dataclass
 class _Window:
-    """Frames whose changes count from one start image."""
+    """Frames whose changes are measured from one start image."""
 
     first: int  # frame
     start: np.ndarray  # [H, W] float32 log brightness
@@ -39,9 +39,9 @@ class _Window:
 class EventImages:
     """Log brightness at the times of frames, reconstructed from events, depth and poses.
 
-    The start image is solved for every window, so that errors of the events (noise, a wrong threshold)
-    do not pile up, and tied to frames of earlier windows. The absolute level is unknown unless grey
-    images tell it.
+    Each window has a start image of its own, so that errors of the events (noise, a wrong threshold) do not
+    accumulate. Frames of earlier windows are included in each solve. Without grey images the absolute level
+    of brightness is unknown.
     """
 
     def __init__(
@@ -92,12 +92,12 @@ class EventImages:
             self._begin(index + 1, frame.timestamp, self._windows[-1].start + change)
 
     def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
-        """Return the image at a frame, with what its grey image says where it has one."""
+        """Return the image at a frame, corrected by its grey image if it has one."""
         image = self._window_of(index).start + self._change(index)
         return self._grey[index].imposed_on(image) if index in self._grey else image
 
     def solve(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
-        """Solve the newest start image (thorough: all of them); return whether there was enough to do so."""
+        """Solve the newest start image (thorough: all of them); return whether one has been solved so far."""
         windows = self._windows if is_thorough else self._windows[-1:]
         iterations = THOROUGH if is_thorough else QUICK
         for window in windows:
@@ -108,7 +108,7 @@ class EventImages:
             chosen = evenly(own, self._config.solved_views)
             views = [self._view(k, trajectory, is_relative=k in chosen) for k in given + chosen]
             solved = solve_start_image(views, self._camera, window.start, iterations)
-            if not given:  # nothing says what the level is: let it be as it was
+            if not given:  # the level is not observed: keep the previous one
                 change = (solved.log_brightness - window.start)[solved.is_observed]
                 solved.log_brightness[:] -= np.median(change) if len(change) else np.float32(0)
             window.start = solved.log_brightness
@@ -117,10 +117,10 @@ class EventImages:
         return self.is_solved
 
     def learn_detail_from_render(self, index: int, difference: np.ndarray) -> None:
-        """Move details of a frame's start image towards a render: the map has seen them from many sides.
+        """Move details of a frame's start image towards a render, which combines many views.
 
-        `difference` [H, W]: log brightness of the render less the image at the frame. Larger structures stay:
-        the solution knows them better. At a frame with a grey image all stays: that has its own details.
+        `difference` [H, W]: log brightness of the render minus that of the image. Larger structures stay,
+        because the solve determines them better. A frame with a grey image changes nothing.
         """
         if index in self._grey:
             return
@@ -131,7 +131,7 @@ class EventImages:
     def set_white_level(self, brightness: float) -> float:
         """Shift all images so that the brightest percent is at `brightness`; return the shift in log.
 
-        Where grey images tell the level, it stays.
+        With grey images the level is known, and the shift is 0.
         """
         if self._grey:
             return 0.0
@@ -142,9 +142,9 @@ class EventImages:
         return shift
 
     def drop_surplus(self, keep: set[int]) -> None:
-        """Drop frames above the limit, from the densest part of the path first; those of `keep` go last.
+        """Drop frames above the limit, from the densest part of the path first; frames in `keep` go last.
 
-        The newer half stays complete.
+        Only the older half of the frames is thinned.
         """
         while len(frames := self.frames) > self._config.max_views:
             older = range(1, max(2, len(frames) // 2))
@@ -163,7 +163,7 @@ class EventImages:
             self._grey[index] = replace(grey, log_brightness=without_noise)
 
     def _tie_to_grey(self, window: _Window, frames: list[int]) -> None:
-        """Shift a start image to what the grey images of its frames say, pixel by pixel where they do."""
+        """Shift a start image to agree with its frames' grey images, per pixel where they are not clipped."""
         total, count = np.zeros(self._camera.shape, np.float32), np.zeros(self._camera.shape, np.float32)
         for k in frames:
             if k in self._grey:
@@ -196,27 +196,27 @@ class EventImages:
 
 
 def evenly(frames: list[int], most: int) -> list[int]:
-    """Return at most `most` of the frames, spread evenly, the last one among them."""
+    """Return at most `most` of the frames, evenly spaced, including the last one."""
     if len(frames) <= most:
         return frames
     return [frames[int(k)] for k in np.linspace(0, len(frames) - 1, most)]
 
 
 class FrameSampler:
-    """Draws the frames that steps of optimisation are for."""
+    """Draws the frame for each optimisation step."""
 
     def __init__(self, random: np.random.Generator, num_recent: int) -> None:
         self._random = random
         self._num_recent = num_recent
-        self._order: list[int] = []  # frames still to come in this round
+        self._order: list[int] = []  # frames not yet drawn in this round
 
     def recent(self, frames: list[int]) -> int:
-        """Draw a frame, half of the time one of the newest."""
+        """Draw a frame: with probability one half one of the newest, else any."""
         pool = frames[-self._num_recent :] if self._random.random() < 0.5 else frames
         return pool[int(self._random.integers(len(pool)))]
 
     def any(self, frames: list[int]) -> int:
-        """Draw a frame, each once before any comes again."""
+        """Draw a frame; every frame is drawn once before any is drawn again."""
         if not self._order:
             self._order = list(self._random.permutation(frames))
         return int(self._order.pop())

@@ -67,7 +67,7 @@ class TsdfVolume:
             blocks = self._grid.compute_unique_block_coordinates(
                 depth_image, self._pixel_rays, T_camera_world, **limits
             )
-        except RuntimeError as error:  # it looks at every fourth pixel, and none of them has depth
+        except RuntimeError as error:  # Open3D samples every fourth pixel; none of them has depth
             if "No block is touched" not in str(error):
                 raise
             return
@@ -78,7 +78,7 @@ class TsdfVolume:
     def mesh(self, min_weight: float = 1.0) -> Any:
         """Return the zero surface where at least `min_weight` views agree, as an Open3D TriangleMesh.
 
-        It may be empty. Vertex colours hold the brightness three times.
+        It may be empty. All three channels of the vertex colours hold the brightness.
         """
         o3d = load_open3d()
         if self.num_frames == 0:

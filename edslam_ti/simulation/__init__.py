@@ -1,6 +1,6 @@
 """Simulated recordings: procedural rooms or meshes, camera paths, events, depth and images.
 
-The names below are loaded on demand, so that the settings alone load neither torch nor Taichi.
+The names below load on demand, so that importing the settings loads neither torch nor Taichi.
 """
 
 import importlib
@@ -45,7 +45,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name when it is first asked for (PEP 562)."""
+    """Load a public name on first access (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

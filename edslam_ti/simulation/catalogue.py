@@ -1,4 +1,4 @@
-"""Built-in scenes by name: the five rooms that stand in for EventReplica's, and scenes kept for tests."""
+"""Built-in scenes by name: five rooms that stand in for EventReplica's, and scenes reserved for tests."""
 
 from edslam_ti.errors import DataError
 from edslam_ti.simulation.rooms import ROOM_NAMES, ROOMS, Room

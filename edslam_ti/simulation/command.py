@@ -1,4 +1,4 @@
-"""What `edslam simulate` does: a built-in room or a mesh, a path, and a recording of both."""
+"""The command `edslam simulate`: records a built-in room or a mesh along a camera path."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ UP_AXES = {
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a recorded trajectory runs in a scene; without a position it keeps its own coordinates."""
+    """Placement of a recorded trajectory in a scene; without a position it keeps its own coordinates."""
 
     position: tuple[float, float, float] | None = None  # metres, of the first camera
     target: tuple[float, float, float] | None = None  # metres, looked at by the first camera
@@ -49,7 +49,7 @@ class Placement:
                 check_setting(name, value, -MAX_METRES, MAX_METRES)
 
     def first_pose(self) -> np.ndarray | None:  # [4, 4]
-        """Return the first pose, or None where the trajectory's own is kept."""
+        """Return the first pose; None: keep the trajectory's own."""
         if (self.position is None) != (self.target is None):
             raise ConfigError("position and look-at: expected both or neither; give the missing one")
         if self.position is None or self.target is None:

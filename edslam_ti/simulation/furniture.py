@@ -43,7 +43,7 @@ def make_palette(
     cloth: tuple[float, str],
     accent: tuple[float, str],
 ) -> Palette:
-    """Return a palette from three wood shades and two cloths (shade, pattern)."""
+    """Return a palette of three wood shades and two cloths (shade, pattern)."""
     rng = builder.rng
 
     def tiled(image: np.ndarray) -> Material:

@@ -32,7 +32,7 @@ def bake(builder: SceneBuilder, lamps: list[Lamp], ambient: float, brightness: f
     """
     rng = np.random.default_rng(seed)
     plain = builder.build("")
-    # Self-luminous quads are the lamps and windows: they cast no shadow.
+    # Self-luminous quads are lamps and windows; they cast no shadow.
     dark = np.array([not q.material.luminous for q in builder.quads])
     scene = RayCaster(plain.vertices, plain.triangles[dark[plain.surfaces]])
 
@@ -41,7 +41,7 @@ def bake(builder: SceneBuilder, lamps: list[Lamp], ambient: float, brightness: f
         w, h = (int(np.clip(np.ceil(np.linalg.norm(side) / SPACING), 2, MAX_TEXELS)) for side in (q.u, q.v))
         b, a = np.mgrid[0:h, 0:w]
         a, b = (a.ravel() + 0.5) / w, (b.ravel() + 0.5) / h
-        # Texels at a border would sit in the neighbouring surface.
+        # Texels at the border would lie inside the neighbouring surface.
         a, b = np.clip(a, 0.03, 0.97), np.clip(b, 0.03, 0.97)
         points.append(q.origin + a[:, None] * q.u + b[:, None] * q.v + 0.008 * q.normal)
         normals.append(np.repeat(q.normal[None], w * h, 0))

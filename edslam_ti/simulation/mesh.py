@@ -1,7 +1,7 @@
-"""Textured or vertex-coloured meshes (obj, ply, glb, ...) as scenes, read through Open3D.
+"""Loads textured or vertex-coloured meshes (obj, ply, glb, ...) as scenes with Open3D.
 
-Brightness is the file's colour (base colour x texture x vertex colour) as it is: scanned meshes such as
-Replica's carry their light in the colours. Axes are the file's (glTF: y up; many scans: z up).
+Brightness is the file's colour (base colour x texture x vertex colour) without shading, because colours of
+scanned meshes such as Replica's contain the light. Axes are the file's (glTF: y up; many scans: z up).
 """
 
 from pathlib import Path

@@ -15,10 +15,10 @@ from edslam_ti.trajectory import Trajectory
 TYPICAL_SPEED = 0.4  # m/s, mean over a long path
 REACH = (0.55, 0.45, 0.22)  # metres, largest excursion along x, y, z
 DWELL = 1.2  # seconds from one sight to the next
-BURST_WIDTH = 0.17  # seconds, Gaussian width of a fast stretch
-MOVE_BURST, GAZE_BURST = 0.9, 1.6  # extra speed in a fast stretch, as a share of the normal speed
+BURST_WIDTH = 0.17  # seconds, Gaussian width of a burst of fast motion
+MOVE_BURST, GAZE_BURST = 0.9, 1.6  # extra speed in a burst, as a share of the normal speed
 UP = np.array([0.0, 0.0, 1.0])
-BURST_INTERVAL = (1.7, 2.6)  # seconds from one fast stretch to the next
+BURST_INTERVAL = (1.7, 2.6)  # seconds from one burst to the next
 
 
 GO, STOP = 1.0, 0.6  # seconds of motion and of rest on a stop-and-go path
@@ -67,8 +67,8 @@ class _Waves:
 class HandHeldPath:
     """Smooth 6-DoF motion inside a room's free box, looking along its sights.
 
-    Position: slow sinusoids. Gaze: a cubic B-spline through the sights. Both run on a warped clock with
-    fast stretches about every two seconds. Roll and a small tremor of hand (3-9 Hz) run on top.
+    Position: slow sinusoids. Gaze: a cubic B-spline through the sights. Both follow a warped clock with a
+    burst of fast motion about every two seconds. Roll and a small hand tremor (3-9 Hz) are added.
     """
 
     def __init__(self, room: Room, duration: float, seed: int = 0, speed: float = 1.0) -> None:
@@ -78,11 +78,11 @@ class HandHeldPath:
         half = np.minimum((room.free_high - room.free_low) / 2, REACH)
         slack = np.maximum((room.free_high - room.free_low) / 2 - half, 0)
         self._centre = (room.free_low + room.free_high) / 2 + slack * rng.uniform(-0.5, 0.5, 3)
-        weights = np.array([0.55, 0.3, 0.12]) * half[:, None]  # sums to 0.97: stays inside with tremor
+        weights = np.array([0.55, 0.3, 0.12]) * half[:, None]  # sum 0.97 leaves room for tremor
         frequency = np.array([0.16, 0.29, 0.53]) * rng.uniform(0.85, 1.15, (3, 3))
         phase = rng.uniform(0, 2 * np.pi, (3, 3))
         slow = _Waves(weights, frequency, phase)
-        # The clock's rate makes the mean speed over a minute the typical one.
+        # The clock's rate is chosen so that the mean speed over a minute is the typical one.
         samples = np.array([slow(t) for t in np.arange(0, 60, 0.02)])
         mean_speed = np.linalg.norm(np.diff(samples, axis=0), axis=1).mean() / 0.02
         bursts, start = [], float(rng.uniform(0.9, 1.5))
@@ -102,7 +102,7 @@ class HandHeldPath:
     def _clock(self, t: float, gain: float) -> float:
         """Return warped time: its rate is 1 + gain exp(-((t - burst)/width)^2), normalised to mean 1."""
         u = t * self._speed
-        area = gain * BURST_WIDTH * np.sqrt(np.pi)  # seconds gained in one fast stretch
+        area = gain * BURST_WIDTH * np.sqrt(np.pi)  # seconds gained in one burst
         bumps = erf((u - self._bursts) / BURST_WIDTH) + erf(self._bursts / BURST_WIDTH)
         return float((u + area / 2 * bumps.sum()) / (1 + area / np.mean(BURST_INTERVAL)))
 
@@ -125,7 +125,7 @@ class HandHeldPath:
 
 
 class RotationPath:
-    """A hand-held path's turns about the point where it starts; nothing moves sideways."""
+    """The rotations of a hand-held path about its start point, without translation."""
 
     def __init__(self, hand_held: HandHeldPath) -> None:
         self.duration = hand_held.duration
@@ -139,7 +139,7 @@ class RotationPath:
 
 
 class StopAndGoPath:
-    """A hand-held path that rests for STOP seconds after every GO seconds of motion, tremor and all."""
+    """A hand-held path that rests, without tremor, for STOP seconds after every GO seconds of motion."""
 
     def __init__(self, hand_held: HandHeldPath) -> None:
         self.duration = hand_held.duration
@@ -153,9 +153,9 @@ class StopAndGoPath:
 
 
 class LoopPath:
-    """An ellipse around the free box while the gaze turns full circle, and back to the first pose.
+    """An ellipse around the free box that returns to the first pose while the gaze turns full circle.
 
-    One turn of the gaze takes about TURN_DURATION, so that what is seen first comes back only at the end.
+    One turn of the gaze takes about TURN_DURATION, so that the first view returns only at the end.
     """
 
     def __init__(self, room: Room, duration: float, seed: int = 0, speed: float = 1.0) -> None:
@@ -180,7 +180,7 @@ class LoopPath:
         """Return T_world_camera at a time in seconds; the same at 0 and at `duration`."""
         u = 2 * np.pi * t / self.duration
         angle = self._rounds * u + self._phase
-        turns = 7 * self._turns  # of the wobbles: whole numbers, so that the path closes
+        turns = 7 * self._turns  # of the sway: whole numbers, so that the path closes
         offset = self._half * (np.cos(angle), np.sin(angle), np.sin(2 * angle))
         position = self._centre + offset + 0.01 * np.sin(3 * turns * u + self._wobble)
         yaw = self._phase + self._direction * self._turns * u + 0.25 * np.sin(turns * u + self._wobble[0])
@@ -191,7 +191,7 @@ class LoopPath:
 
 
 def make_path(room: Room, config: SimulationConfig) -> CameraPath:
-    """Return the kind of path that the settings ask for."""
+    """Return the kind of path that the settings name."""
     if config.path == "loop":
         return LoopPath(room, config.duration, config.seed, config.speed)
     hand_held = HandHeldPath(room, config.duration, config.seed, config.speed)
@@ -218,7 +218,7 @@ def _axis_rotation(axis: int, angle: float) -> np.ndarray:  # [3, 3]
 
 
 class RecordedPath:
-    """A recorded trajectory, its first time stamp moved to 0."""
+    """A recorded trajectory, shifted so that its first time stamp is 0."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""A scene and a camera path become a recording on disk in EventReplica's layout.
+"""Records a scene along a camera path, in EventReplica's layout on disk.
 
 poses_ts.txt, traj.txt          times (s) and camera-to-world poses (16 numbers, OpenCV axes), one per image
 images/frameNNNNNN.png          grey, 8 bit; NNNNNN = milliseconds
@@ -36,7 +36,7 @@ PICTURES = ("images", "depth", "novel_views/images", "novel_views/depth")
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What was written."""
+    """Numbers of what was written."""
 
     folder: Path
     num_events: int
@@ -187,7 +187,7 @@ def _without_gap(events: EventArrays, gap: tuple[float, float] | None) -> EventA
 
 
 class _FrameTimes:
-    """Chooses when to render next, in nanoseconds."""
+    """Chooses the times of rendered frames, in nanoseconds."""
 
     def __init__(self, config: SimulationConfig, path: CameraPath, required: list[int]) -> None:
         self._camera = config.camera
@@ -198,7 +198,7 @@ class _FrameTimes:
         self._step = self._longest
 
     def after(self, now: int, depth: np.ndarray) -> int:
-        """Return the next frame's time: within `max_motion` pixels, never beyond a required time."""
+        """Return the next frame's time: at most `max_motion` pixels later, never beyond a required time."""
         step = min(self._longest, round(1.5 * self._step))
         for _ in range(4):
             motion = self._motion(now, now + step, depth)
@@ -254,7 +254,7 @@ class EventFileWriter:
 
 @dataclass
 class _ImageWriter:
-    """Writes images at their times, each the mean brightness over its exposure."""
+    """Writes images at given times; each is the mean brightness over its exposure."""
 
     folder: Path
     times: list[int]  # nanoseconds
@@ -264,7 +264,7 @@ class _ImageWriter:
     _next: int = 0
 
     def add(self, start: int, grey_start: np.ndarray, end: int, grey_end: np.ndarray) -> None:
-        """Take in the brightness of the interval [start, end], linear in time."""
+        """Add the brightness of the interval [start, end], linear in time."""
         half = round(self.exposure * 0.5e9)
         while self._next < len(self.times) and self.times[self._next] - half <= end:
             t = self.times[self._next]
@@ -283,7 +283,7 @@ class _ImageWriter:
                 self._finish(t)
 
     def finish(self) -> None:
-        """Write images whose exposure the recording cuts off."""
+        """Write images whose exposure extends beyond the recording."""
         for t in list(self._sums):
             self._finish(t)
 
@@ -296,14 +296,14 @@ class _ImageWriter:
 
 @dataclass
 class _DepthWriter:
-    """Writes depth images at their times, with noise when asked for."""
+    """Writes depth images at given times, with noise if the settings say so."""
 
     folder: Path
     times: set[int]  # nanoseconds
     config: SimulationConfig
 
     def add(self, t: int, render: Render) -> None:
-        """Write the depth of a frame if its time is one of a depth image."""
+        """Write the depth of a frame if its time is that of a depth image."""
         if t not in self.times:
             return
         depth = render.depth
@@ -327,7 +327,7 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 
 
 def _write_poses(folder: Path, path: CameraPath, times: list[int]) -> None:
-    """Write times and poses, one a line."""
+    """Write times and poses, one per line."""
     with (folder / "poses_ts.txt").open("w") as stamps, (folder / "traj.txt").open("w") as poses:
         for t in times:
             stamps.write(f"{t / 1e9:.6f}\n")
@@ -361,6 +361,6 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "gray_events_data.npy: rows x, y, t (s), polarity -1/+1, sorted by time; a change of\n"
         f"log(grey + {config.log_epsilon:.6g}) by the contrast threshold fires an event, grey in [0, 1].\n"
         "Pixel centres are at integer coordinates.\n"
-        "novel_views/: true views beside the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
+        "novel_views/: true views near the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
         f"Settings:\n{settings}\n"
     )

@@ -1,7 +1,7 @@
-"""Grey image and exact depth of a scene from any pose, by ray casting.
+"""Renders grey image and exact depth of a scene from any pose by ray casting.
 
-One ray per pixel centre gives depth and, through a filtered texture look-up, brightness; pixels beside
-which another surface begins are cast again with several rays (anti-aliasing where it is needed).
+One ray per pixel centre gives depth and, through a filtered texture look-up, brightness. Pixels next to
+another surface are rendered again with several rays (anti-aliasing at edges).
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from edslam_ti.kernels.texture import mark_edges, pixel_rays, shade, write_sampl
 from edslam_ti.ray_casting import Hits, RayCaster
 from edslam_ti.simulation.scene import Scene
 
-EDGE_CONTRAST = 0.02  # Michelson contrast between neighbouring surfaces from which an edge is refined
+EDGE_CONTRAST = 0.02  # edges with at least this Michelson contrast between their surfaces are anti-aliased
 
 
 @dataclass(frozen=True)
 class Render:
-    """What a camera sees from one pose."""
+    """A camera's view from one pose."""
 
     grey: np.ndarray  # [H, W] float32 in [0, 1]
     depth: np.ndarray  # [H, W] float32 metres along the optical axis at pixel centres, 0: nothing hit

@@ -1,4 +1,4 @@
-"""Five procedural furnished rooms, named as EventReplica's scenes they stand in for.
+"""Five procedural furnished rooms, named after the EventReplica scenes that they stand in for.
 
 World: metres, z up; the floor is z = 0 and the room spans x in [0, width], y in [0, depth].
 """
@@ -22,7 +22,7 @@ ROOM_NAMES = ("room0", "room2", "office0", "office2", "office3")
 
 @dataclass(frozen=True)
 class Room:
-    """A furnished room, where a camera may move in it, and what it should look at."""
+    """A furnished room, the space where a camera may move, and the points it should look at."""
 
     name: str
     scene: Scene
@@ -42,7 +42,7 @@ class RoomBuilder(SceneBuilder):
 
     @contextmanager
     def wall(self, side: str, along: float = 0.0, out: float = 0.0) -> Iterator[None]:
-        """Enter the frame of a wall at `along` metres from its left end, `out` metres before it."""
+        """Enter the frame of a wall at `along` metres from its left end, `out` metres in front of it."""
         x, y, yaw = {
             "north": (0.0, self.depth, 0.0),
             "south": (self.width, 0.0, 180.0),
@@ -91,7 +91,7 @@ class RoomBuilder(SceneBuilder):
     def window_light(
         self, side: str, along: float, z: float, width: float, height: float, power: float
     ) -> None:
-        """Let daylight in through a window: an area light just inside."""
+        """Add daylight from a window: an area light just inside."""
         with self.wall(side, along):
             R, t = self._frame[:3, :3], self._frame[:3, 3]
             centre = R @ np.array([0, -0.06, z + height / 2]) + t
@@ -125,7 +125,7 @@ def _point(vector: np.ndarray) -> Point:
 
 
 def tiled(b: SceneBuilder, image: np.ndarray, texel: float = 0.004, turned: bool = False) -> Material:
-    """Return a material that repeats an image, `texel` metres a pixel."""
+    """Return a material that repeats an image, `texel` metres per pixel."""
     return Material(b.texture(image), texel=texel, turned=turned)
 
 

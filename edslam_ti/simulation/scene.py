@@ -1,4 +1,4 @@
-"""A textured triangle scene: what the renderer draws, and the builder that collects it.
+"""A textured triangle scene for the renderer, and a builder that collects its parts.
 
 World of the built-in rooms: metres, z up, floor at z = 0. Meshes keep the axes of their file.
 """
@@ -18,7 +18,7 @@ NO_LIGHT = -1
 
 @dataclass(frozen=True)
 class Texture:
-    """A grey image and how it continues beyond its borders."""
+    """A grey image, and whether it repeats beyond its borders."""
 
     image: np.ndarray  # [H, W] float32 in [0, 1]
     repeat: bool
@@ -40,7 +40,7 @@ class Scene:
     description: str
 
     def triangle_table(self) -> TriangleTable:
-        """Return what the shading kernel reads of each triangle."""
+        """Return the data of each triangle for the shading kernel."""
         corners = self.vertices[self.triangles].astype(np.float64)  # [T, 3, 3]
         e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normal = np.cross(e1, e2)
@@ -109,13 +109,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class Material:
-    """A texture, how large it is laid out, and how bright."""
+    """A texture with its size on the surface and its brightness."""
 
     texture: int  # index into the builder's textures
     texel: float | None = TEXEL  # metres per texel; None: stretched over the whole face
     tint: float = 1.0
     turned: bool = False  # grain along the other side of the face
-    luminous: bool = False  # shown as it is, without shading
+    luminous: bool = False  # drawn without shading
 
 
 @dataclass
@@ -159,7 +159,7 @@ class SceneBuilder:
     def placed(
         self, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0
     ) -> Iterator[None]:
-        """Add what follows at a position (metres), turned about z, then about x (degrees)."""
+        """Place all that the block adds at a position (metres), turned about z, then about x (degrees)."""
         a, b = np.radians(yaw), np.radians(pitch)
         turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         tip = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])

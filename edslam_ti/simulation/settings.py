@@ -7,7 +7,7 @@ from pydantic import ConfigDict, Field, ValidationError
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError, shown
 
-if TYPE_CHECKING:  # it loads numpy, which options need not wait for
+if TYPE_CHECKING:  # reading options must not load numpy
     from edslam_ti.camera import Camera
 
 DAY = 86400.0  # seconds, the longest recording
@@ -68,7 +68,7 @@ class SimulationConfig(Stage):
     """Seed of path, threshold noise and depth noise."""
 
     def __init__(self, **values: Any) -> None:
-        """Check the values; the first that cannot be used raises `ConfigError`."""
+        """Check the values; the first invalid one raises `ConfigError`."""
         try:
             super().__init__(**values)
         except ValidationError as error:

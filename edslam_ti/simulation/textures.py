@@ -12,7 +12,7 @@ def noise(
 ) -> Array:
     """Return tileable noise [H, W] of zero mean and unit deviation with spectrum 1 / f^roughness.
 
-    `stretch` > 1 draws it out along x (wood grain).
+    `stretch` > 1 elongates it along x (wood grain).
     """
     fy = np.fft.fftfreq(height)[:, None] * height
     fx = np.fft.rfftfreq(width)[None] * width * stretch * height / width
@@ -380,7 +380,7 @@ def keyboard(rng: np.random.Generator) -> Array:
 
 
 def window_view(rng: np.random.Generator, kind: str) -> Array:
-    """What is outside: a town or trees under a bright sky."""
+    """The view outside: a town or trees under a bright sky."""
     height, width = 360, 320
     y = np.linspace(0, 1, height)[:, None]
     image = 0.95 - 0.10 * y + 0.05 * noise(rng, height, width, 1.8, stretch=2)

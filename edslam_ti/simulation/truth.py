@@ -1,6 +1,6 @@
-"""What a simulated recording holds for evaluation only: views beside the path, and the true surfaces.
+"""Writes the data of a simulated recording for evaluation only: novel views and the true surfaces.
 
-novel_views/images/frameNNNNNN.png     grey, 8 bit; NNNNNN = milliseconds of the path's pose it lies beside
+novel_views/images/frameNNNNNN.png     grey, 8 bit; NNNNNN = milliseconds of the nearby pose on the path
 novel_views/depth/frameNNNNNN.png      exact depth, uint16, 5000 units per metre, 0 = missing
 novel_views/traj.txt                   camera-to-world pose of every view (16 numbers), in the files' order
 surfaces.ply                           the scene's triangles, metres, in the world of the poses
@@ -24,9 +24,9 @@ from edslam_ti.simulation.scene import Scene
 DEPTH_UNITS_PER_METRE = 5000  # of the depth PNG; reaches to 13.1 m
 INTERVAL = 0.4  # seconds of the path per view
 COUNTS = (4, 30)  # views at least and at most
-OFFSETS = (0.05, 0.075, 0.1)  # metres sideways or up, in turn
+OFFSETS = (0.05, 0.075, 0.1)  # metres from the path in the image plane, in turn
 TURN = 5.0  # degrees
-DIRECTIONS = 8  # in the image plane, tried in turn until one leads nowhere into an object
+DIRECTIONS = 8  # in the image plane, tried in turn until one does not lead into an object
 CLEARANCE = 0.05  # metres left free around a view
 
 
@@ -75,10 +75,10 @@ def novel_poses(
     pose: Callable[[float], np.ndarray],  # seconds -> T_world_camera [4, 4]
     duration: float,  # seconds
 ) -> list[tuple[int, np.ndarray]]:
-    """Return (milliseconds, T_world_camera) of views 5 to 10 cm beside the path, turned by 5 degrees.
+    """Return (milliseconds, T_world_camera) of views 5 to 10 cm from the path, turned by 5 degrees.
 
-    The directions are spread over the image plane. Where an object is in the way the next direction is
-    tried; where all are blocked there is no view.
+    The directions are evenly distributed in the image plane. If an object is in the way, the next direction
+    is tried; if all are blocked, there is no view.
     """
     caster = RayCaster(scene.vertices, scene.triangles)
     count = int(np.clip(round(duration / INTERVAL), *COUNTS))
@@ -95,7 +95,7 @@ def novel_poses(
         direction = directions[free[0]]
         moved = np.eye(4)
         moved[:3, 3] = offset * direction
-        axis = np.array([-direction[1], direction[0], 0.0])  # turned towards what the path looks at
+        axis = np.array([-direction[1], direction[0], 0.0])  # turn towards the path's view
         moved[:3, :3] = Rotation.from_rotvec(np.radians(-TURN) * axis).as_matrix()
         result.append((ms, T @ moved))
     return result

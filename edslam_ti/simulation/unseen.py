@@ -1,8 +1,8 @@
-"""Built-in scenes beside the five rooms, for measuring on what nothing was tuned on.
+"""Built-in scenes for evaluation on which nothing was tuned, in addition to the five rooms.
 
-`wall` and `corridor` are where single cues fail: geometry says nothing about motion along one flat wall,
-and a bare corridor gives few events and slides along itself. `kitchen`, `workshop` and `library` are
-furnished rooms of other sizes, furniture and light than the five.
+Single cues fail in `wall` and `corridor`: geometry does not constrain motion along one flat wall, and a bare
+corridor gives few events and does not constrain motion along itself. `kitchen`, `workshop` and `library` are
+furnished rooms that differ from the five in size, furniture and light.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from edslam_ti.simulation.rooms import Room, RoomBuilder, door, stretched, tiled
 
 
 def _wall() -> Room:
-    """One flat wall with a mural, seen from 1.6 to 2.5 m; it fills the view and nothing else is there."""
+    """One flat wall with a mural, seen from 1.6 to 2.5 m; it fills the view."""
     b = RoomBuilder(200, 28.0, 2.5, 20.0)
     mural = tiled(b, tx.mural(b.rng))
     with b.wall("north"):

@@ -1,15 +1,15 @@
-"""Whether events and depth tell the same motion: faults of calibration and clocks that no single frame shows.
+"""Checks whether events and depth agree on the motion, which reveals faults of calibration and clocks.
 
 At frames with depth the pose is measured twice: by brightness and depth together, where depth outweighs
-brightness, and by brightness alone. With T the first, T_b the second and X the motion since the keyframe k,
-both by T, the disagreement is d = log(T^-1 T_b). Depth images whose stamps are too early by a delay tau show
-where the camera was before, at the keyframe and now, so that
+brightness, and by brightness alone. Let T be the first pose, T_b the second, and X the motion since the
+keyframe k according to T. The disagreement is d = log(T^-1 T_b). If depth images show the scene a delay tau
+earlier than their stamps say, at the keyframe and now, then
 
     d = tau (v - Ad(X^-1) v_k) + noise,    v: velocities (translation, rotation) at the frame and the keyframe
 
-which robust least squares solves for tau over all frames. What is left of d, in units of its expected size,
-says whether the two kinds of data contradict each other otherwise (a wrong focal length, events of another
-recording, pixels that fire by themselves). A wrong scale of depth cannot be seen: it scales both.
+which robust least squares solves for tau over all frames. The size of d, in units of its expected size, shows
+whether the two kinds of data contradict each other (a wrong focal length, events of another recording, noisy
+pixels). A wrong scale of depth cannot be detected: it scales both poses.
 """
 
 from dataclasses import dataclass
@@ -20,32 +20,33 @@ from edslam_ti.geometry import adjoint, inverse, se3_log
 from edslam_ti.kernels.patch_warp import NormalEquations
 from edslam_ti.trajectory import Trajectory
 
-MOST = 60  # frames that are compared, spread over the run
-MIN_FRAMES = 6  # fewer say nothing
-# Squared disagreement over what residuals let expect, median of the frames. Simulated rooms: 9 to 46 where
-# nothing is wrong; depth 50 ms late 480, focal length 10 % too long 910, 20 pixels that fire at 5 kHz 2800.
+MOST = 60  # frames that are compared, distributed over the run
+MIN_FRAMES = 6  # with fewer there is no result
+# Ratio of observed to expected squared disagreement, median over the frames. Simulated rooms: 9 to 46 without
+# a fault; 480 with depth 50 ms late, 910 with a focal length 10 % too long, 2800 with 20 pixels that fire at
+# 5 kHz.
 CONTRADICTION = 100.0
-# A delay is reported from so many of its standard deviations and so many seconds on. Rooms without a delay:
-# up to 3.5 standard deviations and 3 ms; 10 ms late: 5.2 and 8 ms.
+# A delay is reported if it exceeds this many standard deviations and this many seconds. Simulated rooms give
+# up to 3.5 standard deviations and 3 ms without a delay, 5.2 and 8 ms with depth 10 ms late.
 SURE, SMALLEST_DELAY = 4.5, 0.004
 SMALLEST_SCALE = 1e-6  # of squared residuals
 HUBER = 1.5  # standard deviations
-FROZEN_SHARE = 0.2  # of the compared frames with the depth image of the frame before: depth has stopped
+FROZEN_SHARE = 0.2  # depth has stopped if this share of the compared frames repeats the previous depth image
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """What a whole run says of its recording."""
+    """Agreement of events and depth over a whole run."""
 
     num_frames: int  # compared
-    disagreement: float  # squared, over what residuals let expect
+    disagreement: float  # ratio of observed to expected squared disagreement
     depth_delay_s: float  # by which depth images show an earlier time than their stamps
     depth_delay_sigma_s: float
-    repeated_share: float  # of the compared frames with the very depth image of the frame before
+    repeated_share: float  # of the compared frames that repeat the previous depth image
 
     @property
     def problems(self) -> list[str]:
-        """One line for each fault that is likely, and what to do."""
+        """One line for each likely fault, with the remedy."""
         lines = []
         is_contradiction = self.disagreement > CONTRADICTION
         if is_contradiction and self.repeated_share > FROZEN_SHARE:
@@ -62,8 +63,8 @@ class Consistency:
         if is_contradiction:
             lines.append(
                 f"events and depth contradict each other ({np.sqrt(self.disagreement):.0f} times the "
-                f"expected difference of poses, usual are 3 to 7); check focal length, principal point, "
-                "registration of depth to the event camera, and pixels that fire by themselves"
+                f"expected difference of poses, 3 to 7 is usual); check focal length, principal point, "
+                "registration of depth to the event camera, and noisy pixels"
             )
         return lines
 
@@ -87,7 +88,7 @@ class ConsistencyCheck:
         self._every, self._count = 1, 0
 
     def wants(self) -> bool:
-        """Return whether the next frame with depth is to be compared; half as often when there are many."""
+        """Return whether to compare the next frame with depth; the interval doubles when there are many."""
         self._count += 1
         return self._count % self._every == 0
 
@@ -98,7 +99,7 @@ class ConsistencyCheck:
         T_world_camera: np.ndarray,  # [4, 4] by brightness and depth
         by_brightness: np.ndarray,  # [4, 4] T_world_camera
         system: NormalEquations,  # of the latter
-        is_repeated: bool = False,  # its depth image is that of the frame before
+        is_repeated: bool = False,  # its depth image repeats the previous one
     ) -> None:
         """Add a frame whose pose was measured twice."""
         scale = max(2 * system.cost / max(system.num_surface, 1), SMALLEST_SCALE)
@@ -109,7 +110,7 @@ class ConsistencyCheck:
             self._every *= 2
 
     def result(self, trajectory: Trajectory) -> Consistency | None:
-        """Return what the run says; None: too little was compared."""
+        """Return the result for the run; None: too few frames were compared."""
         if len(self._comparisons) < MIN_FRAMES:
             return None
         observed, expected, squares = [], [], []

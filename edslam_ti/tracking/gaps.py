@@ -1,26 +1,26 @@
-"""Gaps in the event stream: how one is noticed, and how the poses inside it are corrected afterwards."""
+"""Gaps in the event stream: detecting one, and correcting the poses inside it afterwards."""
 
 import numpy as np
 
 from edslam_ti.geometry import inverse, is_near, se3_exp, se3_log
 from edslam_ti.trajectory import PathDraft
 
-# Metres, degrees: where a gap is closed by less, depth has carried the camera through it. Not a setting: it
-# only chooses between two ways to spread a correction.
+# Metres, degrees: if the correction after a gap is smaller, alignment of depth has worked inside it. Not a
+# setting: it only chooses between two ways to distribute the correction.
 CARRIED_BY_DEPTH = (0.02, 2.0)
 
 
 class EventRate:
-    """Events a frame: what is usual, and what came last."""
+    """Numbers of events per frame: the usual one, and those of the last two frames."""
 
     def __init__(self, silent_share: float, slowing_share: float) -> None:
-        """Take the shares of the usual number of events below which a frame is silent, or slowing."""
+        """Below these shares of the usual number of events a frame is silent, or the camera slowing."""
         self._silent_share, self._slowing_share = silent_share, slowing_share
         self._usual = 0.0  # events a frame, a running mean without silent frames
         self._last, self._before = 0, 0
 
     def add(self, count: int) -> None:
-        """Take in the number of events of the next frame."""
+        """Add the number of events of the next frame."""
         self._before, self._last = self._last, count
         if not self.is_silent:
             self._usual = count if self._usual == 0 else 0.9 * self._usual + 0.1 * count
@@ -32,7 +32,7 @@ class EventRate:
 
     @property
     def was_slowing(self) -> bool:
-        """Whether there were few events in the frame before, too: a camera that comes to rest."""
+        """Whether the frame before also had few events, as when a camera comes to rest."""
         return self._before < self._slowing_share * self._usual
 
 
@@ -42,10 +42,10 @@ def bridge(
     after: int,  # first frame after it
     correction: np.ndarray,  # [4, 4] T_new T_old^-1 of the frames after the gap
 ) -> None:
-    """Move all frames after a gap by a correction, and those inside it by part of it.
+    """Correct all frames after a gap, and distribute the correction over the frames inside it.
 
-    Depth alone has carried the camera through the gap. Where the correction shows that it did not, as along
-    a plain wall, the poses inside become a cubic between the ends and their velocities.
+    Poses inside the gap come from alignment of depth alone. If the correction is large, that has failed, as
+    along a plain wall. Then the poses inside are replaced by a cubic through both ends and their velocities.
     """
     for index in range(after, len(path)):
         path.replace(index, correction @ path.pose(index))

@@ -1,6 +1,6 @@
 """Keyframes with a log-brightness image, and direct alignment of images and depth to them.
 
-Everything is relative to the keyframe; where keyframes are in the world is the tracker's business
+All poses here are relative to the keyframe; the tracker knows where keyframes are in the world
 (image_tracker.py).
 """
 
@@ -29,7 +29,7 @@ from edslam_ti.kernels import depth_average
 from edslam_ti.kernels.depth_average import DepthAgreement, PixelRays, average_depth
 from edslam_ti.kernels.patch_warp import NormalEquations, Patches
 
-# Not a setting: the relative decrease of the cost from which on the next, finer level goes on better.
+# Not a setting: below this relative decrease of the cost, the next, finer level takes over.
 SMALL_GAIN = 1e-3
 
 
@@ -43,7 +43,7 @@ class Depth:
 
 @dataclass(frozen=True)
 class BrightnessFrame:
-    """What was measured up to one frame, at the size of brightness images."""
+    """Measurements up to one frame, at the size of brightness images."""
 
     index: int  # of the frame in the trajectory
     timestamp: float  # seconds
@@ -58,19 +58,19 @@ class BrightnessKeyframe:
     index: int  # of the frame in the trajectory
     change: np.ndarray  # [h, w] as in `BrightnessFrame`
     measured: Depth  # at its time
-    depth: Depth  # averaged with that of neighbouring frames
+    depth: Depth  # averaged with depth of neighbouring frames
     log_brightness: np.ndarray  # [h, w]
     points: list[Tensor]  # pixels to align, at full and at half size; see `Patches.points`
     depth_points: Tensor | None  # pixels of the full depth image to align
     next_solution: int  # index of the frame at which the image is solved for again
-    is_new_place: bool = True  # no older keyframe shows much the same
+    is_new_place: bool = True  # no older keyframe shows the same place
 
     def image_at(self, frame: BrightnessFrame) -> np.ndarray:  # [h, w]
         """Return the log brightness at another frame of the same segment of events."""
         return self.log_brightness + (frame.change - self.change)
 
     def reduced(self) -> "BrightnessKeyframe":
-        """Return what places are recognised by: a twentieth of the memory."""
+        """Return the keyframe without the parts that relocalisation does not need: 1/20 of the memory."""
         small = Depth(self.depth.small, self.depth.small)
         nothing = np.zeros((0, 0), np.float32)
         return replace(self, change=nothing, measured=small, depth=small, points=[], depth_points=None)
@@ -78,7 +78,7 @@ class BrightnessKeyframe:
 
 @dataclass(frozen=True)
 class Aligned:
-    """Where a keyframe's surfaces are seen from."""
+    """A pose aligned to a keyframe, and how well it fits."""
 
     T_keyframe_camera: np.ndarray  # [4, 4]
     system: NormalEquations  # at full size
@@ -95,7 +95,7 @@ class Aligned:
         return min(1.0, self.overlap) * max(0.0, 1 - self.misfit / config.images.max_misfit)
 
     def problem(self, config: TrackingConfig) -> str:
-        """Return why the pose cannot be trusted, or nothing."""
+        """Return why the pose cannot be trusted; empty if it can."""
         if self.system.num_surface < MIN_PIXELS:
             return f"only {self.system.num_surface} pixels of the keyframe in view"
         if self.overlap < config.min_inliers:
@@ -108,10 +108,10 @@ class Aligned:
 
 
 class KeyframeAligner:
-    """Solves for keyframes' images, and aligns other images and depth to them."""
+    """Solves for keyframes' images, and aligns images and depth of other frames to them."""
 
     def __init__(self, camera: Camera, config: TrackingConfig, seed: int) -> None:
-        # Images are halved until they are about that wide: the noise of events averages out.
+        # Images are halved until they are about `image_width` wide, which averages out noise of events.
         self._level = max(0, round(math.log2(camera.width / config.images.image_width)))
         self._camera = camera
         self._rays = PixelRays(camera.shape, camera.intrinsics)
@@ -137,7 +137,7 @@ class KeyframeAligner:
         frame: Frame,
         change: np.ndarray,  # [H, W] log brightness
     ) -> BrightnessFrame:
-        """Return what was measured up to a frame, at the size of brightness images."""
+        """Return the measurements up to a frame, at the size of brightness images."""
         for _ in range(self._level):
             change = downscaled(change)
         depth = None if frame.depth is None else self._reduced(frame.depth)
@@ -222,7 +222,7 @@ class KeyframeAligner:
             T, system = levenberg_marquardt(linearise, T, steps, SMALL_GAIN)
         last: tuple[NormalEquations, ...] = (system,)
         if depth is not None and keyframe.depth_points is not None and self._model.depth_weight > 0:
-            # Reduced depth is blurred at edges: the last step uses it as it was measured.
+            # Reduced depth is blurred at edges: the last step uses depth at full size.
             nothing = np.zeros_like(depth.full)
             brightness = linearised(keyframe.points[0], self._brightness_only, [image, small], self.camera)
             geometry = linearised(
@@ -232,7 +232,7 @@ class KeyframeAligner:
             both = last[0] + last[1]
             step = gauss_newton_step(both)  # the minimum is near
             if step is None:
-                system = both  # which says that motion is not observed
+                system = both  # the caller sees that some motion is not observed
             else:
                 T = T @ se3_exp(step)
         T = orthonormalized(T) if np.isfinite(T).all() else start
@@ -256,7 +256,7 @@ class KeyframeAligner:
     def difference(
         self, keyframe: BrightnessKeyframe, image: np.ndarray, T_keyframe_camera: np.ndarray
     ) -> np.ndarray:
-        """Return an image less a keyframe's, at pixels of the keyframe in view (nearest neighbours)."""
+        """Return an image minus the keyframe's, at the keyframe's pixels in view (nearest neighbours)."""
         x, y, u, v = self._warped(keyframe.depth.small, inverse(T_keyframe_camera))
         column, row = np.rint(x).astype(int), np.rint(y).astype(int)
         height, width = image.shape
@@ -264,7 +264,7 @@ class KeyframeAligner:
         return image[row[inside], column[inside]] - keyframe.log_brightness[v[inside], u[inside]]
 
     def flow(self, depth: np.ndarray, T_b_a: np.ndarray) -> float:  # [h, w] of a
-        """Return the median distance in pixels by which what is seen from a moves until b."""
+        """Return the median optical flow from view a to view b, pixels."""
         x, y, u, v = self._warped(depth, T_b_a)
         return float(np.median(np.hypot(x - u, y - v))) if len(x) else 0.0
 

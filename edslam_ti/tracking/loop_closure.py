@@ -1,4 +1,4 @@
-"""Places seen before: drift taken back where an old keyframe is in view again, relocalisation after a gap."""
+"""Loop closure where an old keyframe is in view again, and relocalisation after a gap."""
 
 import numpy as np
 
@@ -13,13 +13,13 @@ from edslam_ti.trajectory import PathDraft
 # Not settings: they bound the time that one frame may take.
 MAX_REVISITS = 3  # old keyframes compared with a new one
 MAX_RECOGNISED = 20  # old keyframes searched after a gap
-# Not settings: they say what an alignment can tell at all.
+# Not settings: they follow from the accuracy of an alignment.
 NO_DRIFT = (0.003, 0.2)  # metres, degrees: smaller corrections are the alignment's own error
-MAX_DRIFT = (0.3, 15.0)  # metres, degrees: larger ones are not believed
+MAX_DRIFT = (0.3, 15.0)  # metres, degrees: larger corrections are rejected
 
 
 class OldKeyframes:
-    """Keyframes of places that the camera has left, and what has been seen of them again."""
+    """Keyframes of places that the camera has left, and the revisits to them."""
 
     def __init__(self, aligner: KeyframeAligner, config: TrackingConfig) -> None:
         self._aligner = aligner
@@ -29,18 +29,18 @@ class OldKeyframes:
 
     @property
     def newest(self) -> BrightnessKeyframe:
-        """The keyframe that was left last."""
+        """The keyframe added last."""
         return self._kept[-1]
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def add(self, keyframe: BrightnessKeyframe) -> None:
-        """Keep what a place is recognised by."""
+        """Keep the parts of a keyframe that loop closure and relocalisation need."""
         self._kept.append(keyframe.reduced())
 
     def close_loop(self, keyframe: BrightnessKeyframe, path: PathDraft) -> str:
-        """Take back the drift since an older keyframe that is in view again; return what happened."""
+        """Correct the drift since an older keyframe that is in view again; return a message."""
         settings = self._config.images
         T_now = path.pose(keyframe.index)
         old_enough = [k for k in self._kept if keyframe.index - k.index >= 2 * settings.window]
@@ -65,7 +65,7 @@ class OldKeyframes:
     def relocalised(
         self, keyframe: BrightnessKeyframe, path: PathDraft
     ) -> tuple[np.ndarray, str] | None:  # [4, 4] T_world_camera
-        """Return the pose of a keyframe after a gap by an older one, and what happened; None: no match."""
+        """Return a keyframe's pose relocalised by an older keyframe, and a message; None: no match."""
         T_now = path.pose(keyframe.index)
         for old in self._kept[::-1][:MAX_RECOGNISED]:
             T_old_new = pose_by_features(old, keyframe, self._aligner.camera)
@@ -83,7 +83,7 @@ class OldKeyframes:
         settings: ImageTrackingConfig = self._config.images
         old, T_world_old = self._aligner.with_points(old), path.pose(old.index)
         T = inverse(T_world_old) @ start
-        for _ in range(2):  # images are known up to an offset
+        for _ in range(2):  # images are known up to an offset: estimate it again at the better pose
             difference = self._aligner.difference(old, new.log_brightness, T)
             if len(difference) < MIN_PIXELS // 4:
                 return None
@@ -94,7 +94,7 @@ class OldKeyframes:
         return T_world_old @ T if is_same and aligned.overlap > settings.revisit_overlap / 2 else None
 
     def _correct(self, keyframe: BrightnessKeyframe, path: PathDraft) -> None:
-        """Move all frames so that keyframes agree with their neighbours and with all revisits."""
+        """Move all frames so that keyframes best agree with their neighbours and with all revisits."""
         seen = {k for revisit in self._revisits for k in (revisit.old, revisit.new)}
         nodes = sorted(seen | {k.index for k in self._kept} | {keyframe.index})
         moved = corrections(nodes, [path.pose(k) for k in nodes], self._revisits)

@@ -1,4 +1,4 @@
-"""What is known of a motion before it is measured: velocity changes little from frame to frame.
+"""Prior of the motion: velocity changes little from frame to frame.
 
 White noise on acceleration (Barfoot, Tong, Sarkka: Batch continuous-time trajectory estimation as exactly
 sparse Gaussian process regression, 2014). With poses T_k at times t_k, d_k = t_{k+1} - t_k and velocities
@@ -14,7 +14,7 @@ import numpy as np
 
 from edslam_ti.geometry import adjoint, inverse, se3_exp, se3_log
 
-REMEMBERED = 20  # observations that q and the size of errors are averaged over
+REMEMBERED = 20  # q and the error ratio are averaged over this many observations
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class MotionPrior:
 
     def __init__(self) -> None:
         self._accelerations: deque[np.ndarray] = deque(maxlen=REMEMBERED)  # [6] q, as observed
-        self._errors: deque[float] = deque(maxlen=REMEMBERED)  # squares against what was expected
+        self._errors: deque[float] = deque(maxlen=REMEMBERED)  # ratios of observed to predicted squared error
 
     @property
     def is_known(self) -> bool:
@@ -41,18 +41,18 @@ class MotionPrior:
 
     @property
     def error(self) -> float:
-        """How much larger squared errors are than informations say."""
+        """Ratio of observed to predicted squared error."""
         return float(np.mean(self._errors))
 
     def learn_motion(self, timestamps: np.ndarray, poses: Sequence[np.ndarray]) -> None:
-        """Learn from three or more poses that are known: mean velocities differ by variance q d / 3."""
+        """Learn q from three or more known poses, whose mean velocities differ with variance q d / 3."""
         spans = timestamps[2:] - timestamps[:-2]
         squares = np.diff(_velocities(timestamps, poses), axis=0) ** 2 * (3 / spans)[:, None]
         for translation, rotation in zip(squares[:, :3].mean(1), squares[:, 3:].mean(1)):
             self._accelerations.append(np.repeat([translation, rotation], 3))
 
     def learn_error(self, twist: np.ndarray, information: np.ndarray) -> None:  # [6], [6, 6]
-        """Learn from the error of a measurement how far informations are to be believed."""
+        """Learn the ratio of observed to predicted squared error from a measurement's error."""
         self._errors.append(float(twist @ information @ twist) / 6)
 
     def smoothed(self, measured: Sequence[MeasuredPose]) -> list[np.ndarray]:  # N times [4, 4]

@@ -100,10 +100,10 @@ class BidirectionalPatchTracker:
         return best.result
 
     def consistency(self, trajectory: Trajectory) -> None:
-        """Return nothing: time surfaces alone are too inexact to judge the data."""
+        """Return None: time surfaces alone are too inaccurate to judge the data."""
 
     def refer_to(self, frame: Frame) -> None:
-        """Align the next frames to this one, whose pose is on the trajectory, and forget earlier ones."""
+        """Align the next frames to this one, whose pose is on the trajectory, and drop earlier references."""
         self._surfaces.reset()
         self._keyframe = self._previous = self._with_patches(frame)
 
@@ -154,7 +154,7 @@ class BidirectionalPatchTracker:
     def _problem(
         self, current: _Reference, references: list[tuple[_Reference, np.ndarray]], level: int
     ) -> "_Problem":
-        """Return Eq. 5 over all references, in both directions unless the settings or the depth rule one out.
+        """Return Eq. 5 over all references, in both directions unless settings or missing depth exclude one.
 
         The new frame's patches can be warped only where it has depth.
         """
@@ -175,7 +175,7 @@ class BidirectionalPatchTracker:
     def _with_patches(self, frame: Frame) -> _Reference:
         """Draw patches where the time surface exceeds its threshold and depth is known.
 
-        Before the first events there is no surface: then they are drawn where there is depth.
+        Before the first events there is no surface: then patches are drawn wherever there is depth.
         """
         config, view = self._config, self._surfaces.build(frame)
         finest = view.level(0)

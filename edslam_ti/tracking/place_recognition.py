@@ -1,4 +1,4 @@
-"""Places recognised by their brightness images: features matched, poses from their depth (SIFT, PnP)."""
+"""Place recognition: matches features of brightness images and solves for the pose with depth (SIFT, PnP)."""
 
 import cv2
 import numpy as np
@@ -7,13 +7,13 @@ from edslam_ti.camera import Camera
 from edslam_ti.geometry import inverse
 from edslam_ti.tracking.keyframes import BrightnessKeyframe
 
-MIN_MATCHES = 15  # features that must agree for a keyframe to be recognised
+MIN_MATCHES = 15  # features that must agree with one pose
 
 
 def pose_by_features(
     old: BrightnessKeyframe, new: BrightnessKeyframe, camera: Camera
 ) -> np.ndarray | None:  # [4, 4]
-    """Return T_old_new by features that both keyframes' images show, or None. `camera`: of these images."""
+    """Return T_old_new from features that both keyframes' images show, or None. `camera`: of these images."""
     detector = cv2.SIFT.create(nfeatures=500, contrastThreshold=0.02)
     found = [detector.detectAndCompute(_as_picture(k.log_brightness), None) for k in (old, new)]
     (old_points, old_features), (new_points, new_features) = found

@@ -1,4 +1,4 @@
-"""Poses that agree with their neighbours and with places seen again: a pose graph, solved by Open3D."""
+"""A pose graph of keyframes and revisits, optimised by Open3D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from edslam_ti.geometry import inverse, orthonormalized, se3_exp, se3_log
 from edslam_ti.open3d_loader import load_open3d
 
-# Standard deviations in metres and radians: of the motion over one frame, which adds up, and of a revisit.
+# Standard deviations in metres and radians: of the motion over one frame (they accumulate), and of a revisit.
 DRIFT = (3e-4, 3e-4)
 REVISIT = (1e-3, 1e-3)
 
@@ -27,10 +27,10 @@ def corrections(
     poses: Sequence[np.ndarray],  # [4, 4] T_world_camera of each
     revisits: Sequence[Revisit],  # between frames that are nodes
 ) -> list[np.ndarray]:  # [4, 4] each, T_new T_old^-1
-    """Return by what every node moves, in the world, to agree best with its neighbours and the revisits.
+    """Return every node's correction, in the world frame, that best agrees with neighbours and revisits.
 
-    Least squares of the differences between relative poses as they are measured and as they come out,
-    weighted by the inverse of their variance (Choi, Zhou and Koltun 2015, without their line process).
+    Least squares of the differences between measured and corrected relative poses, weighted by the inverse
+    of their variance (Choi, Zhou and Koltun 2015, without their line process).
     """
     registration = load_open3d().pipelines.registration
     graph = registration.PoseGraph()
@@ -39,7 +39,7 @@ def corrections(
 
     def connect(a: int, b: int, T_a_b: np.ndarray, deviations: tuple[float, float], count: int) -> None:
         metres, radians = deviations
-        information = np.diag([1 / radians**2] * 3 + [1 / metres**2] * 3) / count  # Open3D: turns first
+        information = np.diag([1 / radians**2] * 3 + [1 / metres**2] * 3) / count  # Open3D: rotation first
         edge = registration.PoseGraphEdge(b, a, T_a_b, information, uncertain=False)
         graph.edges.append(edge)
 
@@ -63,7 +63,7 @@ def spread(
     nodes: Sequence[int],  # frames, ascending
     corrections: Sequence[np.ndarray],  # [4, 4] of the nodes
 ) -> np.ndarray:  # [4, 4]
-    """Return a frame's correction: between two nodes part of each, beyond the ends that of the end."""
+    """Return a frame's correction: interpolated between two nodes, constant beyond the first and last."""
     k = int(np.searchsorted(nodes, frame, side="right")) - 1
     if k < 0 or k >= len(nodes) - 1:
         return corrections[max(k, 0)]

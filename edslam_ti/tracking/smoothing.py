@@ -1,7 +1,7 @@
-"""Poses between two frames with depth, corrected by both ends and by the motion prior.
+"""Corrects poses between two frames with depth, using both ends and the motion prior.
 
-Between depth images poses hang on brightness alone. The drift of brightness alone is visible at the frames
-with depth at both ends; in between it is distributed linearly, and the motion prior smooths what comes out.
+Between depth images, poses are measured by brightness alone. Its drift is visible at the frames with depth at
+both ends. It is distributed linearly over the frames between, and the motion prior smooths the result.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from edslam_ti.tracking.keyframes import BrightnessFrame
 from edslam_ti.tracking.motion_prior import MeasuredPose, MotionPrior
 from edslam_ti.trajectory import PathDraft
 
-SMOOTHED_FROM = 2  # frames before those that are smoothed; two give the velocity there, more change nothing
+SMOOTHED_FROM = 2  # frames included before the smoothed ones; two give the velocity, more change nothing
 
 
 class PoseSmoother:
-    """Learns how velocities change and how exact brightness is, and corrects poses accordingly."""
+    """Learns how quickly velocities change and how accurate brightness is, and corrects poses accordingly."""
 
     def __init__(self) -> None:
         self._motion = MotionPrior()
@@ -41,7 +41,7 @@ class PoseSmoother:
         for f, T, system in zip(frames[1:-1], poses[1:-1], systems[1:-1]):
             share = (f.timestamp - first.timestamp) / (last.timestamp - first.timestamp)
             corrected = T @ se3_exp((1 - share) * start + share * end)
-            # Errors of neighbouring frames are alike: together they count as one.
+            # Errors of neighbouring frames are correlated: together they count as one measurement.
             information = system.H / (self._motion.error * (len(frames) - 2))
             measured.append(MeasuredPose(f.index, f.timestamp, corrected, information))
         measured.append(MeasuredPose(last.index, last.timestamp, known[1], None))
@@ -55,7 +55,7 @@ class PoseSmoother:
     ) -> None:
         """Learn from the errors of brightness alone, and from the poses of frames with depth."""
         for twist, information in errors:
-            if twist.any():  # the keyframe has no error towards itself
+            if twist.any():  # the keyframe has no error relative to itself
                 self._motion.learn_error(twist, information)
         with_depth = [f for f in recent if f.depth is not None]
         timestamps = np.array([f.timestamp for f in with_depth])
@@ -64,7 +64,7 @@ class PoseSmoother:
     def _smooth(
         self, measured: list[MeasuredPose], recent: Sequence[BrightnessFrame], path: PathDraft
     ) -> None:
-        """Smooth poses between two frames with depth, and once more those between the two before."""
+        """Smooth the poses of this interval between frames with depth, and again those of the one before."""
         if self._motion.is_known:
             follows = len(self._settled) > 0 and np.array_equal(
                 self._settled[-1].T_world_camera, measured[0].T_world_camera

@@ -47,7 +47,7 @@ class SurfaceFrame:
 
 
 class SurfaceFrameBuilder:
-    """Keeps the last time stamp of every pixel, for the surfaces of frames that follow each other."""
+    """Builds the surfaces of consecutive frames; keeps the last time stamp of every pixel."""
 
     def __init__(self, camera: Camera, config: TimeSurfaceConfig) -> None:
         self._config = config
@@ -55,7 +55,7 @@ class SurfaceFrameBuilder:
         self.noisy_pixels = NoisyPixels(camera.shape)
 
     def build(self, frame: Frame) -> SurfaceFrame:
-        """Take in the frame's events, and return it with its smoothed surface."""
+        """Add the frame's events, and return the frame with its smoothed surface."""
         events = frame.events
         update_last_timestamps(events.x, events.y, events.t, self._last_timestamps)
         self.noisy_pixels.add(frame.event_counts)
@@ -66,5 +66,5 @@ class SurfaceFrameBuilder:
         return SurfaceFrame(replace(frame, events=Events.empty()), surface)  # they are in the surface
 
     def reset(self) -> None:
-        """Forget all events."""
+        """Remove all events."""
         self._last_timestamps.fill(-np.inf)

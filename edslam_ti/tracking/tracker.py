@@ -1,4 +1,4 @@
-"""What a tracker is, what it returns, and the tracker that knows the true poses."""
+"""The interface of trackers, their results, and a tracker that returns the true poses."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from edslam_ti.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Measurement:
-    """How exactly a frame's pose was measured against another frame's."""
+    """Uncertainty of a frame's pose relative to the frame it was aligned to."""
 
     reference: int  # index of the frame that it was aligned to
     covariance: np.ndarray  # [6, 6] of xi in T_reference_camera exp(xi); metres, radians
@@ -21,12 +21,12 @@ class Measurement:
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """A pose and how far it can be trusted. A failure is a result, not an exception."""
+    """A pose and its quality. A failure is a result, not an exception."""
 
     T_world_camera: np.ndarray  # [4, 4]
     converged: bool
     quality: float  # fraction of patch pixels in agreement, 0 to 1
-    message: str = ""  # why it failed, or what else is worth the log
+    message: str = ""  # why it failed, or another event for the log
     # Better poses T_world_camera [4, 4] of earlier frames, by index.
     corrections: Mapping[int, np.ndarray] = field(default_factory=dict)
     measurement: Measurement | None = None  # None: the pose is given or predicted, not measured
@@ -34,7 +34,7 @@ class TrackingResult:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A result, and whether it needs no second one from another start."""
+    """A result, and whether it is good enough to skip a second attempt from another start."""
 
     result: TrackingResult
     is_sure: bool
@@ -43,30 +43,30 @@ class Attempt:
 
 
 class Tracker(Protocol):
-    """Finds the pose of a frame; the first frame gets the pose it is expected at."""
+    """Finds the pose of a frame; the first frame gets the expected pose."""
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the pose of `frame`, expected near `guess` [4, 4]; `trajectory` holds those before it.
+        """Return the pose of `frame`, expected near `guess` [4, 4]; `trajectory` holds the earlier poses.
 
-        What the frame says of earlier poses comes back as corrections: the trajectory is not changed here.
+        It must not change the trajectory: the result contains corrections of earlier poses.
         """
 
     def consistency(self, trajectory: Trajectory) -> Consistency | None:
-        """Return whether the data of a finished run told one motion; None: the tracker does not know."""
+        """Return whether events and depth of a finished run agree; None: the tracker does not know."""
 
 
 class TruePoses:
-    """A tracker that knows: `--poses truth`, for mapping alone."""
+    """A tracker that returns the true poses, for mapping alone (`--poses truth`)."""
 
     def __init__(
         self,
         true_pose: Callable[[float], np.ndarray | None],
-        likely_pose: Callable[[float], np.ndarray] | None = None,  # where there is no true one
+        likely_pose: Callable[[float], np.ndarray] | None = None,  # used where there is no true pose
     ) -> None:
         self._true_pose, self._likely_pose = true_pose, likely_pose
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
-        """Return the true pose; where it is not known, the frame is lost."""
+        """Return the true pose; where it is unknown, the frame is lost."""
         pose = self._true_pose(frame.timestamp)
         if pose is not None:
             return TrackingResult(pose, True, 1.0)
@@ -75,15 +75,15 @@ class TruePoses:
         return TrackingResult(guess, False, 0.0, "no true pose at this time")
 
     def consistency(self, trajectory: Trajectory) -> None:
-        """Return nothing: true poses agree with themselves."""
+        """Return None: there is nothing to compare."""
 
 
 def best_attempt(
     attempt: Callable[[np.ndarray], Attempt],  # from a start [4, 4]
     predicted: np.ndarray,  # [4, 4] at constant velocity
-    last: np.ndarray,  # [4, 4] as after a sudden stop
+    last: np.ndarray,  # [4, 4] right after a sudden stop
 ) -> Attempt:
-    """Return the attempt of better quality; the one from the last pose is left out if the first is sure."""
+    """Return the better attempt; the one from the last pose is skipped if the first is sure."""
     first = attempt(predicted)
     if first.is_sure:
         return first

@@ -1,11 +1,11 @@
-"""How exactly poses are known: covariances from the normal equations, scaled by the residuals.
+"""Covariances of poses, from the normal equations and the size of the residuals.
 
-A Gauss-Newton system H of residuals divided by their standard deviation has the covariance s^2 H^-1, with
-s^2 the mean square of those residuals, which corrects standard deviations that were assumed too large or too
-small. Residuals of neighbouring pixels are alike, which this does not know: INFLATION makes up for it.
+A Gauss-Newton system H of residuals divided by their standard deviation has the covariance s^2 H^-1. The mean
+square s^2 of those residuals corrects assumed standard deviations that are too large or too small. The
+formula treats residuals of neighbouring pixels as independent; INFLATION makes up for their correlation.
 
-A frame's pose is measured against a reference frame, whose own covariance adds to it (carried along by the
-adjoint), so that sigmas grow from keyframe to keyframe, as drift does. A closed loop is not counted.
+A frame's pose is measured relative to a reference frame, whose own covariance is added (transformed by the
+adjoint). So sigmas grow from keyframe to keyframe, as drift does. Loop closures do not reduce them.
 """
 
 from collections.abc import Sequence
@@ -17,18 +17,18 @@ from edslam_ti.kernels.patch_warp import NormalEquations
 from edslam_ti.tracking.tracker import Measurement, TrackingResult
 from edslam_ti.trajectory import Trajectory
 
-# Ratio of squared errors to s^2 H^-1, measured in simulated rooms: the median over frames of recordings with
+# Ratio of squared errors to s^2 H^-1, measured in simulated rooms: median over the frames of recordings with
 # exact and Kinect-like depth at 20 and 5 Hz (docs/experiments.md).
 INFLATION = 16.0
 SMALLEST_SCALE = 1e-4  # s^2; exact depth would leave no uncertainty at all
-UNKNOWN_MOTION = 0.5  # a lost frame's error grows by this share of the motion that was predicted for it
-UNKNOWN_STEP = (0.01, 0.01)  # metres, radians: by this at least
+UNKNOWN_MOTION = 0.5  # a lost frame's sigma grows by this share of its predicted motion
+UNKNOWN_STEP = (0.01, 0.01)  # metres, radians: and by at least this
 
 
 def covariance(systems: Sequence[NormalEquations]) -> np.ndarray | None:  # [6, 6] of xi in T exp(xi)
-    """Return the covariance of a pose that all of the systems were minimised for; None: not determined.
+    """Return the covariance of the pose that minimises all systems together; None: not determined.
 
-    Every system's residuals are of one kind, which is scaled by its own mean square.
+    Each system has residuals of one kind, and is scaled by their mean square.
     """
     information = np.zeros((6, 6))
     for system in systems:
@@ -44,7 +44,7 @@ def covariance(systems: Sequence[NormalEquations]) -> np.ndarray | None:  # [6, 
 
 
 def measured(reference: int, systems: Sequence[NormalEquations]) -> Measurement | None:
-    """Return how exactly a pose was measured against a reference frame; None: not determined."""
+    """Return the uncertainty of a pose relative to a reference frame; None: not determined."""
     found = covariance(systems)
     return None if found is None else Measurement(reference, found)
 
@@ -52,7 +52,7 @@ def measured(reference: int, systems: Sequence[NormalEquations]) -> Measurement 
 def absolute_covariances(
     results: Sequence[TrackingResult], trajectory: Trajectory
 ) -> list[np.ndarray]:  # [6, 6] each, of xi in T_world_camera exp(xi)
-    """Return the covariance of every pose about the first frame's, which is given."""
+    """Return the covariance of every pose relative to the first, which is exact."""
     found: list[np.ndarray] = []
     for index, result in enumerate(results):
         if index == 0:
@@ -75,7 +75,7 @@ def sigmas(covariances: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]: 
 
 
 def _carried(covariance: np.ndarray, trajectory: Trajectory, a: int, b: int) -> np.ndarray:
-    """Return what a covariance at frame a means for frame b, if only a were uncertain."""
+    """Return the covariance of frame b that follows from that of frame a, given their exact relative pose."""
     A = adjoint(inverse(trajectory.pose(b)) @ trajectory.pose(a))
     return np.asarray(A @ covariance @ A.T)
 

@@ -135,7 +135,7 @@ def _noted(called: set[str], name: str, method: Callable[..., Any], *arguments: 
     return method(*arguments)
 
 
-def test_what_depends_on_time_comes_again_in_every_round() -> None:
+def test_every_round_repeats_data_that_depends_on_time() -> None:
     once = LoopSequence()
     thrice = RepeatedSequence(once, 3)
     rounds = START + np.arange(13) * 0.1

@@ -45,7 +45,7 @@ def test_indices_are_not_taken_for_milliseconds(tmp_path: Path, step: int, first
 def test_a_rate_gives_indices_their_times(tmp_path: Path) -> None:
     folder = by_index(tmp_path / "a")
     given = EventReplicaSequence(folder, depth_rate=20.0)
-    assert given.notes == [f"{folder / 'images'}: numbered as depth is: taken at the same 20 Hz"]
+    assert given.notes == [f"{folder / 'images'}: numbered like depth: assumed at the same rate, 20 Hz"]
     (folder / "camera.json").write_text(json.dumps(CAMERA | {"depth_rate": 20, "image_rate": 20}))
     stated = EventReplicaSequence(folder)
     assert stated.notes == []

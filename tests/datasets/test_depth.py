@@ -110,7 +110,7 @@ def test_flat_images_of_a_wall_are_kept(tmp_path: Path) -> None:
     assert sequence.notes == []
 
 
-def test_a_run_of_images_that_begins_broken_begins_later(folder: Path) -> None:
+def test_unreadable_first_images_are_skipped(folder: Path) -> None:
     for ms in (50, 100):
         (folder / f"depth/frame{ms:06d}.png").write_bytes(b"x")
     sequence = EventReplicaSequence(folder)
@@ -135,7 +135,7 @@ def test_names_that_are_not_utf_8_are_read(folder: Path) -> None:
     [lambda p: p.mkdir(), lambda p: p.symlink_to(p.name), lambda p: os.mkfifo(p),
      lambda p: p.symlink_to("/dev/zero"), lambda p: p.symlink_to("/nonexistent/x")],
 )  # fmt: skip
-def test_what_is_no_file_is_no_image(folder: Path, make: Callable[[Path], Any]) -> None:
+def test_only_regular_files_are_read_as_images(folder: Path, make: Callable[[Path], Any]) -> None:
     path = folder / "depth/frame000150.png"
     path.unlink()
     make(path)

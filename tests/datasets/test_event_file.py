@@ -130,7 +130,7 @@ event_file.EventFile(Path(sys.argv[1]), 32, 24, progress=progress)
 
 
 @pytest.mark.usefixtures("copied")
-def test_a_killed_copy_is_never_taken_for_finished_and_is_removed(tmp_path: Path, cache: Path) -> None:
+def test_an_interrupted_copy_is_never_used_and_is_removed(tmp_path: Path, cache: Path) -> None:
     path = saved(tmp_path, some_events())
     assert subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode == -9
     [partial] = cache.iterdir()
@@ -173,7 +173,7 @@ def test_without_a_copy_events_are_the_same(
         monkeypatch.setattr("edslam_ti.datasets.event_copy.os.fsync", full)
     caplog.clear()
     events = opened(path, is_text=is_text)
-    assert "they are checked anew each time" in caplog.records[0].message
+    assert "they are checked again each time" in caplog.records[0].message
     assert (len(events), events.num_dropped) == (len(expected), expected.num_dropped) == (19_999, 1)
     assert events.time_range == expected.time_range
     for k in range(10):
@@ -191,7 +191,7 @@ def test_a_long_first_reading_is_followed(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("copied")
-def test_a_burst_takes_no_memory_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_burst_needs_no_additional_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path / "cache"))
     count = 4_000_000  # 52 MB in one slice
@@ -232,7 +232,7 @@ BAD = {
 @pytest.mark.parametrize("row", [499, 500, 1700])
 @pytest.mark.parametrize("case", BAD)
 @pytest.mark.usefixtures("copied")
-def test_a_single_bad_row_is_left_out_and_told(
+def test_a_single_bad_row_is_left_out_and_noted(
     tmp_path: Path, case: str, row: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     (column, value), reason = BAD[case]
@@ -249,7 +249,7 @@ def test_a_single_bad_row_is_left_out_and_told(
     assert (again.num_dropped, again.notes) == (1, events.notes)
 
 
-def test_bad_rows_beside_gaps_take_no_good_ones_with_them(tmp_path: Path) -> None:
+def test_bad_rows_next_to_gaps_do_not_remove_good_ones(tmp_path: Path) -> None:
     rows = some_events(end=3.0)
     rows[1000:, 2] += 10
     rows[2000:, 2] += 10
@@ -279,7 +279,7 @@ def test_a_few_stamps_of_another_time_at_the_ends_are_left_out(tmp_path: Path, r
     assert "expected stamps in order" in events.notes[0]
 
 
-def test_a_quiet_beginning_is_no_other_time(tmp_path: Path) -> None:
+def test_a_quiet_start_is_not_left_out_as_another_time(tmp_path: Path) -> None:
     rows = some_events(end=10.0)
     rows[3:, 2] += 90
     assert_same(opened(saved(tmp_path, rows)).between(-np.inf, np.inf), rows)
@@ -303,7 +303,7 @@ def test_a_bad_stretch_of_a_long_file_is_refused(tmp_path: Path) -> None:
     assert event_checks.WINDOW == 8
 
 
-def test_the_reason_that_is_told_is_the_usual_one(tmp_path: Path) -> None:
+def test_the_reported_reason_is_the_most_frequent_one(tmp_path: Path) -> None:
     rows = some_events()
     rows[5, 0] = 99
     rows[:, 3] = np.arange(3000) % 4
@@ -360,11 +360,11 @@ def test_structured_arrays_are_read_by_their_names(tmp_path: Path, names: tuple[
 
 
 @pytest.mark.parametrize("order", ["txyp", "xypt"])
-def test_columns_in_another_order_are_recognised(tmp_path: Path, order: str) -> None:
+def test_columns_in_another_order_are_detected(tmp_path: Path, order: str) -> None:
     rows = some_events()
     events = opened(saved(tmp_path, rows[:, ["xytp".index(name) for name in order]]))
     assert_same(events.between(0, 1), rows)
-    assert events.notes == (f"columns look like {' '.join(order)} and are read so",)
+    assert events.notes == (f"columns look like {' '.join(order)} and are read in that order",)
     rows[:, 2] *= 1e6
     message = rf"columns look like {' '.join(order)}; .* \[:, {order.index('t')}\] by 1e6"
     with pytest.raises(DataError, match=message):
@@ -489,11 +489,11 @@ def columns(order: str, time: float = 1.0) -> str:
 
 
 @pytest.mark.parametrize("order", ["xytp", "xypt"])
-def test_columns_of_a_text_are_recognised(tmp_path: Path, order: str) -> None:
+def test_columns_of_a_text_are_detected(tmp_path: Path, order: str) -> None:
     events = opened(text(tmp_path, columns(order)), is_text=True)
     assert events.between(0, 1).t == pytest.approx(some_events()[:, 2], abs=1e-12)
     assert (events.between(0, 1).x == some_events()[:, 0]).all()
-    assert events.notes == (f"columns look like {' '.join(order)} and are read so",)
+    assert events.notes == (f"columns look like {' '.join(order)} and are read in that order",)
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_several_event_folders_are_chosen_by_threshold(tmp_path: Path) -> None:
     assert EventReplicaSequence(folder).contrast_threshold == 0.25
 
 
-def test_locally_unsorted_stamps_come_out_sorted_and_complete(tmp_path: Path) -> None:
+def test_locally_unsorted_stamps_are_sorted_and_complete(tmp_path: Path) -> None:
     events = some_events(20000)
     block = np.floor(events[:, 2] * 1000)
     shuffled = events[np.argsort(block + np.random.default_rng(1).random(len(events)) * 0.99)]
@@ -281,7 +281,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "no events": (lambda f: save_events(f, np.empty((0, 4))), r"npy: expected events, got an empty array"),
     "events file of 0 bytes": (_write(EVENTS_FILE, ""), r"npy: the file is empty"),
     "not a npy": (_write(EVENTS_FILE, "hello, not numpy"), r"not readable as a NumPy \.npy file"),
-    "truncated": (_truncate, r"truncated: the header promises 3000 events"),
+    "truncated": (_truncate, r"truncated: the header states 3000 events"),
     "wrong shape": (_events(lambda e: e[:, :3]), r"\(N, 4\) array .* got shape \(3000, 3\)"),
     "x outside": (_set(1700, 0, WIDTH), r"row 1700: expected x in 0 to 31 .* = 32, "),
     "y negative": (_set(1700, 1, -1), r"row 1700: expected x in 0 to 31 and y in 0 to 23"),
@@ -388,7 +388,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "threshold tiny": (_camera(contrast_threshold=1e-300), r"contrast_threshold: .*greater than or equal"),
     "scale huge": (_camera(depth_scale=1e300), r"depth_scale: .*less than or equal to 1000000"),
     "width of 30 digits": (_camera(width=10**30), r"width: .*less than or equal to 32767, got 1000"),
-    "key twice": (_write("camera.json", '{"fx": 30, "fx": 31}'), r"the key 'fx' stands twice"),
+    "key twice": (_write("camera.json", '{"fx": 30, "fx": 31}'), r"the key 'fx' occurs twice"),
     "nested deeply": (
         _write("camera.json", "[" * 100_000),
         r"not readable as JSON: nested",
@@ -436,7 +436,7 @@ def test_a_description_is_one_short_line_of_text(tmp_path: Path, text: str, show
     assert EventReplicaSequence(folder).description == shown
 
 
-def test_camera_json_may_begin_with_a_mark_and_hold_other_programs_keys(tmp_path: Path) -> None:
+def test_camera_json_may_have_a_byte_order_mark_and_unknown_keys(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "s")
     values = CAMERA | {"k1": 0.0, "distortion": [0, 0], "serial": "x" * 100_000, "nested": {"a": [1]}}
     (folder / "camera.json").write_text("\ufeff" + json.dumps(values), encoding="utf-8")

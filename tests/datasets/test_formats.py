@@ -74,7 +74,7 @@ def test_an_added_format_is_listed_in_errors(
 
 
 @pytest.mark.usefixtures("noted")
-def test_a_folder_of_the_added_format_is_known_as_a_sequence(data: Path) -> None:
+def test_a_folder_of_the_added_format_is_detected(data: Path) -> None:
     with pytest.raises(ConfigError, match=r"itself a sequence; use --data-dir .*noted --scene shelf"):
         find_sequence(settings(data / "noted" / "shelf", "desk"))
 
@@ -85,7 +85,7 @@ def test_every_format_is_detected_without_being_named(data: Path) -> None:
     assert find_sequence(settings(data, "office0")) == Found("builtin", None)
 
 
-def test_a_recording_comes_before_the_built_in_room_of_its_name(data: Path) -> None:
+def test_a_recording_takes_precedence_over_a_built_in_room(data: Path) -> None:
     write_sequence(data / "event_replica" / "office0")
     assert find_sequence(settings(data, "office0")).dataset == "event_replica"
     assert find_sequence(settings(data, "office0", "builtin")) == Found("builtin", None)

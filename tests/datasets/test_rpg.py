@@ -177,7 +177,7 @@ def test_lists_of_images_that_are_no_text_are_refused(folder: Path, content: byt
     assert str(caught.value).isprintable()
 
 
-def test_lists_of_images_may_begin_with_a_mark_and_hold_other_encodings_in_comments(folder: Path) -> None:
+def test_lists_of_images_may_have_a_byte_order_mark_and_other_encodings_in_comments(folder: Path) -> None:
     text = (folder / "images.txt").read_bytes().replace(b"\n", b"\r\n")
     (folder / "images.txt").write_bytes(b"\xef\xbb\xbf# caf\xe9\r\n" + text)
     assert len(RpgSequence(folder).image_timestamps) == 3

@@ -120,7 +120,7 @@ def test_sequence_without_images_or_truth_is_sampled_all_the_same() -> None:
 
 
 @pytest.mark.parametrize(("start", "duration"), [(5.0, None), (0.0, 0.01), (0.97, None), (0.3, 0.02)])
-def test_fewer_than_two_depth_images_is_an_error_that_says_what_there_is(
+def test_fewer_than_two_depth_images_is_an_error_that_states_the_coverage(
     start: float, duration: float | None
 ) -> None:
     with pytest.raises(DataError, match=r"at least 2 depth images .* depth covers 0\.050 to 1\.000 s"):

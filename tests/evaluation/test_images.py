@@ -21,7 +21,7 @@ def distorted(image: np.ndarray, slope: float, offset: float) -> np.ndarray:
     return np.asarray(np.maximum(np.exp(log) - 0.1, 0) ** (1 / 2.2))
 
 
-def test_a_slope_and_an_offset_in_log_are_undone_over_the_whole_set() -> None:
+def test_fit_removes_slope_and_offset_in_log_for_the_whole_set() -> None:
     truths = [0.4 + 0.5 * image for image in pictures()]  # bright: nothing is clipped
     predictions = [distorted(image, slope=0.9, offset=-0.05) for image in truths]
     everywhere = [np.ones(t.shape, bool) for t in truths]

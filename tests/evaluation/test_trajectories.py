@@ -110,7 +110,7 @@ def test_a_straight_path_has_errors_too() -> None:
     assert errors.aligned_positions == pytest.approx(noisy[:, :3, 3], abs=1e-3)
 
 
-def test_a_path_that_stands_still_has_errors_too() -> None:
+def test_a_stationary_path_also_has_errors() -> None:
     still = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
     errors = trajectory_errors(still, moved(still, SOME_MOTION))
     assert errors.ate_max_cm < 1e-6

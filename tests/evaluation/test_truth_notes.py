@@ -72,7 +72,7 @@ def test_scale_that_explains_the_error_is_named() -> None:
     [
         (
             lambda T: path_of(rotations=Rotation.from_quat(ROTATIONS.as_quat()[:, [3, 0, 1, 2]])).poses,
-            "orientations look wrong: the truth's look like quaternions wxyz, read as xyzw; so read, ATE",
+            "orientations look wrong: the truth's look like quaternions wxyz, read as xyzw; then ATE",
         ),
         (np.linalg.inv, "poses look inverted: the truth's look like inverted poses (world-to-camera)"),
         (lambda T: T @ OPENGL, "look like OpenGL's axes"),
@@ -161,10 +161,10 @@ def test_slow_truth_is_no_better_than_its_interpolation() -> None:
 @pytest.mark.parametrize(
     ("times", "words"),
     [
-        (1e9 * TIMES, "looks as if in nanoseconds"),
-        (1e6 * TIMES, "looks as if in microseconds"),
-        (1e3 * TIMES, "looks as if in milliseconds"),
-        (1e9 * (TIMES + 1.6e9), "looks as if in nanoseconds"),
+        (1e9 * TIMES, "looks as if it were in nanoseconds"),
+        (1e6 * TIMES, "looks as if it were in microseconds"),
+        (1e3 * TIMES, "looks as if it were in milliseconds"),
+        (1e9 * (TIMES + 1.6e9), "looks as if it were in nanoseconds"),
         (TIMES + 100, "They begin 100 s apart"),
         (TIMES + 1.6e9, "They begin 1.6e+09 s apart"),
         (np.r_[-100.0, 1.5, 100 + TIMES[2:]], "The truth has 1 poses in that time"),
@@ -176,7 +176,7 @@ def test_other_clocks_are_refused_in_one_line(times: np.ndarray, words: str) -> 
     assert words in str(refused.value)
     assert len(str(refused.value)) < 400
     if "nano" in words:
-        with pytest.raises(DataError, match="The estimate looks as if in nanoseconds"):
+        with pytest.raises(DataError, match="The estimate looks as if it were in nanoseconds"):
             trajectory_errors(path_of(times=times), noisy())
 
 

@@ -67,7 +67,7 @@ def expected_change(events: Events, time: float, end: float) -> np.ndarray:
     return total
 
 
-def test_change_counts_events_and_lies_beyond_the_last_and_before_the_next(
+def test_change_counts_events_plus_the_bias_of_last_and_next_event(
     archive: ChangeArchive, events: Events
 ) -> None:
     assert archive.frames == [0, 1, 3]
@@ -85,7 +85,7 @@ def test_events_of_either_polarity_count_as_their_threshold() -> None:
     assert archive.change(0)[1, 4] == pytest.approx(-1.1 - 0.2 * 1.1)
 
 
-def test_next_event_may_come_many_frames_later() -> None:
+def test_next_event_may_be_many_frames_later() -> None:
     archive = ChangeArchive(CAMERA.shape)
     one = Events(np.array([3], np.int16), np.array([2], np.int16), np.array([0.5]), np.array([-1], np.int8))
     for k in range(4):
@@ -93,7 +93,7 @@ def test_next_event_may_come_many_frames_later() -> None:
     assert [archive.change(k)[2, 3] for k in range(4)] == pytest.approx([-0.2, -0.2, -0.2, -1.2])
 
 
-def test_counting_begins_again_where_it_ended(archive: ChangeArchive, events: Events) -> None:
+def test_archive_starts_from_zero_after_a_reset(archive: ChangeArchive, events: Events) -> None:
     before = [archive.change(k) for k in archive.frames]
     ended = archive.reset()
     np.testing.assert_allclose(ended, archive.change(3), atol=1e-6)  # no next event is known yet

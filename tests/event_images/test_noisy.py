@@ -59,7 +59,7 @@ def test_a_lone_pixel_in_the_dark_is_found_and_a_whole_patch_is_not() -> None:
     assert not noisy.mask[11:19, 11:19].any()
 
 
-def test_neighbours_stand_in_for_noisy_pixels_alone() -> None:
+def test_only_noisy_pixels_are_replaced_by_their_neighbours() -> None:
     noisy = NoisyPixels(SHAPE)
     image = np.random.default_rng(1).normal(size=SHAPE).astype(np.float32)
     assert noisy.replaced(image) is image

@@ -49,7 +49,7 @@ def test_without_exposure_the_image_is_brought_to_the_time_of_the_frame() -> Non
 
 
 @pytest.mark.slow
-def test_events_of_the_exposure_take_out_its_motion_blur(tmp_path: Path) -> None:
+def test_events_of_the_exposure_remove_its_motion_blur(tmp_path: Path) -> None:
     motion = {"duration": 0.4, "speed": 5.0}
     blurred = EventReplicaSequence(record_tiny_room(tmp_path / "blurred", exposure=0.08, **motion))
     sharp = EventReplicaSequence(record_tiny_room(tmp_path / "sharp", **motion))

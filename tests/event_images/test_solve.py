@@ -86,7 +86,7 @@ def test_wrong_depth_of_one_view_counts_little() -> None:
 
 
 @pytest.mark.parametrize("depth", [None, np.zeros(CAMERA.shape, np.float32)])
-def test_without_depth_nothing_is_observed_and_the_start_stays(depth: np.ndarray | None) -> None:
+def test_without_depth_no_pixel_is_observed_and_the_start_is_kept(depth: np.ndarray | None) -> None:
     blind = [EventView(v.change, depth, v.T_world_camera) for v in views(4)]
     solved = solve_start_image(blind, CAMERA, BLANK, ITERATIONS)
     assert not solved.is_observed.any()

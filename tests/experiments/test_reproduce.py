@@ -100,7 +100,7 @@ def test_a_loop_is_played_again_where_it_ended(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_long_stream_reports_what_frames_cost(tiny_sequence: EventDepthSequence, tmp_path: Path) -> None:
+def test_long_stream_reports_the_cost_of_frames(tiny_sequence: EventDepthSequence, tmp_path: Path) -> None:
     config = Config(duration=0.2, poses="truth").updated({"mapping": {"iterations": 1}})
     lines: list[str] = []
     measure(tiny_sequence, config, tmp_path, length=0.1, report=lines.append)
@@ -188,7 +188,7 @@ def tiny_case(scene: str, **differences: Any) -> Case:
 
 
 @pytest.mark.slow
-def test_bench_records_failures_continues_and_is_resumed(
+def test_runs_record_failures_continue_and_resume(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "event_replica.yaml").write_text("tracking: {levels: 2}")
@@ -311,7 +311,7 @@ def test_ablations_share_the_defaults_and_every_setting_exists() -> None:
     assert [c.row for c in cases] == ["office0-kinect-20hz"] * 2 + ["wall-kinect-20hz"] * 2
 
 
-def test_ablation_tables_name_the_default_and_tell_of_failures() -> None:
+def test_ablation_tables_mark_the_default_and_list_failures() -> None:
     results = [
         result("office0-kinect-20hz", 0, v.name, 0.1 * k) for k, v in enumerate(ablation_variants(), 1)
     ]
@@ -332,7 +332,7 @@ def test_tables_are_inserted_between_their_marks(tmp_path: Path) -> None:
         insert_into(document, "tracking", "x")
 
 
-def test_app_says_what_it_expects(tmp_path: Path) -> None:
+def test_usage_errors_state_the_expected_arguments(tmp_path: Path) -> None:
     for arguments, message in (
         ([], "expected a command first: tracking, ablations"),
         (["track"], "expected a command first"),

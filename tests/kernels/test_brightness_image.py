@@ -105,7 +105,7 @@ def test_image_is_the_same_for_any_number_of_threads(device: str) -> None:
     assert np.array_equal(images[1], images[2])
 
 
-def test_what_was_not_observed_keeps_its_prior() -> None:
+def test_unobserved_pixels_keep_their_prior() -> None:
     prior = RANDOM.normal(0, 0.3, CAMERA.shape).astype(np.float32)
     np.testing.assert_array_equal(solved(prior, [], 12, True), prior)
     away = np.eye(4)

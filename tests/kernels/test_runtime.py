@@ -48,7 +48,7 @@ def test_debug_run_notices_an_index_out_of_bounds(
         _read(values, 4, out)
 
 
-def test_kernel_that_does_not_compile_says_where() -> None:
+def test_compile_error_of_a_kernel_names_the_line() -> None:
     with pytest.raises(NameError, match=r"test_runtime.py.*in _nameless[^$]*= nowhere_defined"):
         _nameless(np.zeros(1, np.int32))
 

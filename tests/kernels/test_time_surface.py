@@ -45,7 +45,7 @@ def test_microseconds_survive_at_late_times() -> None:
     assert ratio == pytest.approx(1e-6, rel=1e-3)
 
 
-def test_numbers_of_events_match_the_twin_and_the_newest_polarity_stays() -> None:
+def test_event_counts_and_newest_polarity_match_the_twin() -> None:
     x, y, _, polarity = make_events(2000, 1)
     counts, last = np.zeros((*SHAPE, 2), np.int32), np.zeros(SHAPE, np.int8)
     for part in (slice(0, 700), slice(700, 700), slice(700, 2000)):  # one of them empty

@@ -132,7 +132,7 @@ def test_mapped_pixels_get_no_second_gaussians(
     assert first.num_gaussians < all_of_them.num_gaussians < 4 * first.num_gaussians
 
 
-def test_view_of_what_may_show_is_that_of_the_whole_map(
+def test_view_of_drawable_gaussians_equals_that_of_the_whole_map(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     slam, mapper = mapped(tiny_sequence, tiny_samples[:2], iterations=0, finish=False)
@@ -152,7 +152,7 @@ def test_map_never_exceeds_its_largest_size(
     assert 1000 < mapper.num_gaussians <= 1500
 
 
-def test_small_map_covers_more_of_what_comes_late(
+def test_small_map_covers_more_of_the_last_view(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def gaps() -> float:
@@ -207,7 +207,7 @@ def test_map_follows_when_a_revisit_corrects_the_path(
     assert following - clean < 0.5 * (staying - clean)
 
 
-def test_start_image_is_solved_as_often_when_frames_are_forgotten(
+def test_start_image_is_solved_as_often_when_frames_are_dropped(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slam = make_slam(tiny_sequence, tiny_samples, settings(poses="truth", mapping=FEW | {"max_views": 10}))

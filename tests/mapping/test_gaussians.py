@@ -59,7 +59,7 @@ class AdamByHand:
         return result
 
 
-def test_added_gaussians_are_what_was_asked_for() -> None:
+def test_added_gaussians_have_the_given_parameters() -> None:
     gaussians = GaussianMap(CONFIG)
     assert len(gaussians) == 0
     means, scales = torch.tensor([[0.1, 0.2, 1.0]]), torch.tensor([[0.01, 0.02, 0.03]])
@@ -101,7 +101,7 @@ def test_moments_follow_their_gaussians_through_adding_and_keeping() -> None:
     step()
 
 
-def test_a_part_is_optimised_as_the_whole_would_be_and_the_rest_stays() -> None:
+def test_a_subset_is_optimised_like_the_whole_map_and_the_rest_is_unchanged() -> None:
     whole, same = GaussianMap(CONFIG), GaussianMap(CONFIG)
     for gaussians in (whole, same):
         add(gaussians, 60)

@@ -82,7 +82,7 @@ def test_discs_lie_on_a_tilted_plane_and_look_round_from_the_camera() -> None:
         np.testing.assert_allclose(seen, 1.0, atol=1e-3)  # a circle, seen along the ray
 
 
-def test_disc_beside_missing_depth_or_an_edge_faces_the_camera() -> None:
+def test_disc_next_to_missing_depth_or_an_edge_faces_the_camera() -> None:
     camera = Camera(20, 10, 20.0, 20.0, 9.5, 4.5)
     depth = np.full(camera.shape, 2.0, np.float32)
     depth[:, 10:] = 3.0
@@ -110,7 +110,7 @@ def test_empty_map_needs_gaussians_wherever_there_is_depth() -> None:
     assert not densify_mask(nothing, nothing, nothing, 0.8, 50.0).any()
 
 
-def test_one_pixel_is_taken_of_every_block_as_wide_as_the_spacing() -> None:
+def test_one_pixel_is_chosen_per_block_of_the_spacing() -> None:
     spacing = np.full((6, 9), 3)
     spacing[:, 3:] = 1
     expected = np.ones((6, 9), bool)

@@ -37,7 +37,7 @@ def test_every_mapper_is_complete(
     assert [path.name for path in tmp_path.iterdir()] == (["map.ply"] if mapper.num_gaussians else [])
 
 
-def test_gaussian_mapper_tells_its_keyframes_and_saves_its_gaussians(
+def test_gaussian_mapper_lists_its_keyframes_and_saves_its_gaussians(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], tmp_path: Path
 ) -> None:
     mapper = mapped(tiny_sequence, tiny_samples, "ed_slam")

@@ -71,7 +71,7 @@ def test_image_without_texture_or_map_moves_no_pose() -> None:
     assert (aligner.corrected(nothing, nothing, nothing, nothing, T) == T).all()  # no map
 
 
-def test_frames_without_depth_come_half_way_to_where_the_map_looks_like_their_images(
+def test_frames_without_depth_move_half_way_to_the_pose_aligned_to_the_map(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     sparse = [replace(s, depth=s.depth if k % 3 == 0 else None) for k, s in enumerate(tiny_samples)]

@@ -37,7 +37,7 @@ def test_background_fills_an_empty_view() -> None:
     assert (view.alpha == 0).all()
 
 
-def test_background_shows_through_by_what_is_left_of_alpha() -> None:
+def test_background_has_the_weight_one_minus_alpha() -> None:
     gaussians = wall(2.0, brightness=0.8).activated()
     dark, bright = (render(gaussians, CAMERA, torch.eye(4), background=b) for b in (0.0, 1.0))
     torch.testing.assert_close(bright.intensity - dark.intensity, 1 - dark.alpha, rtol=0, atol=1e-6)

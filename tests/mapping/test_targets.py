@@ -64,7 +64,7 @@ def test_images_are_close_to_the_truth_in_one_window_or_several(
     assert np.median(errors(images, tiny_samples)) < 0.26
 
 
-def test_details_of_the_start_come_from_the_map(
+def test_details_of_the_start_image_are_learned_from_renders(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     images, _ = images_of(tiny_sequence, tiny_samples)
@@ -110,7 +110,7 @@ def test_unequal_thresholds_count_as_what_they_are(tmp_path: Path) -> None:
     assert of_unequal < 0.6 * of_equal  # 0.19 and 0.40 were measured
 
 
-def test_pixels_that_fire_by_themselves_are_found_and_replaced_by_their_neighbours(
+def test_noisy_pixels_are_found_and_replaced_by_their_neighbours(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     clean, _ = images_of(tiny_sequence, tiny_samples)
@@ -133,12 +133,12 @@ def test_half_of_the_recent_draws_are_of_the_newest_frames() -> None:
     assert np.mean(drawn >= 190) == pytest.approx(0.5 + 0.5 * 5 / 100, abs=0.04)
 
 
-def test_every_frame_is_drawn_once_before_any_comes_again() -> None:
+def test_every_frame_is_drawn_once_before_any_repeats() -> None:
     sampler, frames = FrameSampler(np.random.default_rng(0), num_recent=5), [3, 5, 8, 9]
     for _ in range(3):
         assert sorted(sampler.any(frames) for _ in frames) == frames
 
 
-def test_frames_are_spread_evenly_with_the_last_among_them() -> None:
+def test_frames_are_evenly_spaced_and_include_the_last() -> None:
     assert evenly([1, 2, 3], 3) == [1, 2, 3]
     assert evenly(list(range(11)), 3) == [0, 5, 10]

@@ -61,7 +61,7 @@ def test_view_of_the_mesh_returns_the_fused_depth_and_brightness(plane_mesh) -> 
     assert np.abs(seen_brightness - brightness)[seen].mean() < 0.015
 
 
-def test_view_from_beside_sees_depth_along_the_optical_axis(plane_mesh) -> None:
+def test_view_from_the_side_has_depth_along_the_optical_axis(plane_mesh) -> None:
     T = np.eye(4)
     T[:3, 3] = [0.1, 0.05, -0.3]
     _, depth = MeshView(plane_mesh).render(CAMERA, T)

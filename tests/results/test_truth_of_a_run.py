@@ -138,10 +138,10 @@ def test_part_of_the_evaluation_that_fails_is_left_out(
     for part in ("picture of the path", "fly-through", "mesh", "novel views"):
         [line] = [line for line in printed.splitlines() if line.startswith(f"left out: {part}: ")]
         assert len(line) <= LONGEST_MESSAGE
-        assert line in (folder / "log.txt").read_text()
+        assert line[:200] in (folder / "log.txt").read_text()
 
 
-def test_stamps_since_the_epoch_are_written_as_they_came(recording: Path, tmp_path: Path) -> None:
+def test_stamps_since_the_epoch_are_written_unchanged(recording: Path, tmp_path: Path) -> None:
     epoch, events_file = 1642650000, next(recording.glob("event_threshold_*")) / "gray_events_data.npy"
     events = np.load(events_file).astype(np.float64)
     events[:, 2] += epoch

@@ -16,7 +16,7 @@ from edslam_ti.simulation import HandHeldPath, look_at
 from edslam_ti.simulation.truth import novel_poses
 
 
-def test_views_lie_beside_the_path_and_look_where_it_looks(tiny_sequence: EventDepthSequence) -> None:
+def test_novel_views_are_near_the_path_and_look_the_same_way(tiny_sequence: EventDepthSequence) -> None:
     views = tiny_sequence.novel_views()
     assert [view.timestamp for view in views] == [0.088, 0.262, 0.438, 0.612]
     for view, distance in zip(views, (0.05, 0.075, 0.1, 0.05)):

@@ -76,6 +76,6 @@ def test_depth_that_has_stopped_is_named(sequence: EventDepthSequence) -> None:
     assert "the depth stream has stopped" in found.problems[0]
 
 
-def test_too_few_frames_say_nothing(sequence: EventDepthSequence) -> None:
+def test_too_few_frames_give_no_result(sequence: EventDepthSequence) -> None:
     slam = tracked(sequence, samples(sequence)[:8])
     assert slam.tracker.consistency(slam.trajectory) is None

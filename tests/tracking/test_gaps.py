@@ -17,7 +17,7 @@ def rate(*counts: int) -> EventRate:
     return result
 
 
-def test_few_events_are_silence_only_beside_many() -> None:
+def test_few_events_are_silence_only_relative_to_many() -> None:
     assert not rate(5).is_silent
     assert not rate(1000, 21).is_silent
     assert rate(1000, 19).is_silent
@@ -51,7 +51,7 @@ def test_frames_after_a_gap_move_by_the_correction_and_those_inside_along_a_cubi
     assert (draft.trajectory.pose(4) == draft.trajectory.pose(3)).all()  # nothing is written to it
 
 
-def test_a_small_correction_is_spread_evenly_over_the_gap() -> None:
+def test_a_small_correction_is_distributed_evenly_over_the_gap() -> None:
     correction = se3_exp(np.array([0.009, 0.0, 0.0, 0.0, 0.0, 0.0]))
     draft, _ = path_with_gap(correction)
     before = [draft.pose(k) for k in range(10)]

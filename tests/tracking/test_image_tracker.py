@@ -57,7 +57,7 @@ def test_brightness_images_are_better_than_time_surfaces_between_depth_images(
     assert ate_cm(by_brightness, sequence) < 0.7 * ate_cm(by_surfaces, sequence)
 
 
-def test_poses_between_depth_images_are_corrected_when_the_next_one_comes(
+def test_poses_between_depth_images_are_corrected_at_the_next_depth_image(
     sequence: EventDepthSequence, samples: list[Sample]
 ) -> None:
     slam = tracked(sequence, sparse(samples, 4))
@@ -88,7 +88,7 @@ def errors_cm(slam: Slam, samples: list[Sample]) -> np.ndarray:  # [F]
     return 100 * np.linalg.norm(slam.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
 
 
-def test_after_a_blackout_an_old_keyframe_says_where_the_camera_is(
+def test_after_a_blackout_an_old_keyframe_relocalises_the_camera(
     sequence: EventDepthSequence, samples: list[Sample]
 ) -> None:
     # Neither events nor depth while the camera turns back: constant velocity leads 20 cm astray.
@@ -109,9 +109,7 @@ def test_after_a_blackout_an_old_keyframe_says_where_the_camera_is(
     assert errors_cm(found, path)[list(blackout)].max() < 0.2 * errors_cm(not_found, path)[33]
 
 
-def test_drift_is_taken_back_where_a_place_is_seen_again(
-    sequence: EventDepthSequence, samples: list[Sample]
-) -> None:
+def test_revisit_removes_drift(sequence: EventDepthSequence, samples: list[Sample]) -> None:
     # Depth that becomes 2 % too long on the way there, and soon right again on the way back: a path of
     # another length, which does not end where it began.
     path, n = there_and_back(samples), len(samples)
@@ -166,7 +164,7 @@ def with_noisy_pixels(sample: Sample, pixels: np.ndarray, rate: float) -> Sample
 
 
 @pytest.mark.parametrize("is_brightness", [True, False])
-def test_pixels_that_fire_by_themselves_are_masked(
+def test_noisy_pixels_are_masked(
     sequence: EventDepthSequence, samples: list[Sample], is_brightness: bool
 ) -> None:
     config = settings(tracking={"brightness": is_brightness})

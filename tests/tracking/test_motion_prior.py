@@ -89,7 +89,7 @@ def test_quickness_of_the_motion_is_learned() -> None:
     np.testing.assert_allclose(np.mean(means, 0), q, rtol=0.3)
 
 
-def test_errors_are_compared_with_what_was_expected() -> None:
+def test_errors_are_compared_with_their_prediction() -> None:
     prior = MotionPrior()
     assert not prior.is_known
     random, sigma = np.random.default_rng(3), 0.003

@@ -137,7 +137,7 @@ def test_depth_image_of_zeros_does_not_end_a_run(
     assert ate_cm(slam, tiny_sequence) < 1.0
 
 
-def test_run_may_begin_with_a_depth_image_of_zeros(
+def test_run_may_start_with_a_depth_image_of_zeros(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
     first = replace(tiny_samples[0], depth=np.zeros(tiny_sequence.camera.shape, np.float32))

@@ -33,7 +33,7 @@ def rmse(poses: list[np.ndarray], truth: list[np.ndarray]) -> float:
     return float(np.sqrt(np.mean([np.sum((a - b)[:3, 3] ** 2) for a, b in zip(poses, truth)])))
 
 
-def test_closing_a_loop_takes_back_most_of_the_drift() -> None:
+def test_closing_a_loop_removes_most_of_the_drift() -> None:
     truth = circle(61)
     before = drifted(truth, seed=0)
     loop = [Revisit(10 * k, 10 * (60 - 2 + k), inverse(truth[k]) @ truth[58 + k]) for k in (0, 1, 2)]

@@ -33,7 +33,7 @@ def test_covariance_is_the_inverse_information_scaled_by_the_residuals() -> None
     np.testing.assert_allclose(both, found / 2)
 
 
-def test_what_is_not_observed_has_no_covariance() -> None:
+def test_unobserved_motion_has_no_covariance() -> None:
     assert covariance([system(np.diag([1.0, 1, 1, 1, 1, 0]))]) is None
     assert covariance([system(np.full((6, 6), np.nan))]) is None
     assert measured(3, [system(np.zeros((6, 6)))]) is None
