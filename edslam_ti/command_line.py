@@ -117,7 +117,7 @@ def launch(main: Callable[[], None]) -> None:
         sys.exit(FAILED)
     except OSError as error:  # of the system: a full disk, say, which names no file
         reason = error.strerror or str(error)
-        _exit(FAILED, f"{error.filename}: {reason}" if error.filename is not None else str(error))
+        _exit(FAILED, f"{error.filename}: {reason}" if error.filename is not None else reason)
     except Stopped as stopped:
         _exit(
             SIGNALLED + stopped.number,
