@@ -140,7 +140,7 @@ class KeyframeAligner:
         """Return what was measured up to a frame, at the size of brightness images."""
         for _ in range(self._level):
             change = downscaled(change)
-        depth = None if frame.depth is None else self._reduced(frame.depth)
+        depth = None if frame.tracked_depth is None else self._reduced(frame.tracked_depth)
         return BrightnessFrame(index, frame.timestamp, change, depth)
 
     def _reduced(self, depth: np.ndarray) -> Depth:  # [H, W] metres
