@@ -14,11 +14,12 @@ A gap in the events leads from Tracking to Coasting, their return to Starting, a
 where an older keyframe recognises it (loop_closure.py), to Tracking.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edslam_ti.alignment import MIN_PIXELS
+from edslam_ti.alignment import MIN_PIXELS, mean_cost
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig, TrackingConfig
 from edslam_ti.event_images.change import BrightnessChange
@@ -28,6 +29,18 @@ from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
 from edslam_ti.kernels.patch_warp import NormalEquations
 from edslam_ti.tracking.consistency import Consistency, ConsistencyCheck
+from edslam_ti.tracking.depth_check import (
+    BETTER,
+    FEWEST,
+    FITS,
+    ROUNDS,
+    SETTLED_FLOW,
+    SMALLEST_FLOW,
+    UNUSUAL,
+    DepthCheck,
+    left_out,
+    sets_to_try,
+)
 from edslam_ti.tracking.gaps import EventRate, bridge
 from edslam_ti.tracking.keyframes import (
     Aligned,
@@ -66,6 +79,18 @@ class Tracking:
     num_misfits: int = 0  # frames in a row that could not be aligned
 
 
+@dataclass(frozen=True)
+class _FirstImage:
+    """A first image, from recent frames of which some may have lost their depth."""
+
+    keyframe: BrightnessKeyframe
+    recent: list[BrightnessFrame]
+    path: PathDraft
+    flows: list[float]  # px, between poses with depth and by brightness alone
+    misfit: float  # log brightness, mean of the frames by brightness alone
+    left_out: frozenset[int]  # frames whose depth is
+
+
 class BrightnessTracker:
     """Aligns each frame to the current keyframe's log-brightness image and depth (Tracker).
 
@@ -94,6 +119,8 @@ class BrightnessTracker:
         self._usual_misfit = np.inf  # log brightness; until the first image is aligned, any is usual
         self._smoother = PoseSmoother()
         self._check = ConsistencyCheck()
+        self._depth_check = DepthCheck()
+        self._left_out: list[int] = []  # frames found to have wrong depth as the first image was solved for
         self._last_depth: np.ndarray | None = None  # [H, W] metres, as it came
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
@@ -111,11 +138,16 @@ class BrightnessTracker:
         self._recent = [*self._recent, newest][-self._settings.window :]
         state = self._state
         if isinstance(state, Tracking):
+            usual_misfit = self._usual_misfit
             best = self._follow(state.keyframe, newest, guess, path)
+            path.newest = best.result.T_world_camera
+            is_repeated = self._is_repeated(frame)
+            without = self._compare(state.keyframe, newest, best, usual_misfit, is_repeated, path)
+            if without is not None:
+                newest, best = replace(newest, depth=None), without
+                self._recent[-1], self._usual_misfit = newest, usual_misfit
             result = best.result
             path.newest = result.T_world_camera
-            if result.converged:
-                self._compare(state.keyframe, newest, self._is_repeated(frame), path)
             self._last_depth = frame.depth if frame.depth is not None else self._last_depth
             note = note or self._keep_up(state, newest, result.converged, best.overlap, path)
         else:
@@ -131,6 +163,10 @@ class BrightnessTracker:
             if isinstance(self._state, Starting) and (keyframe := self._first_keyframe(path)) is not None:
                 note = self._relocalise(keyframe, self._state.silent_since, path)
                 self._state = Tracking(keyframe)
+                if self._left_out:
+                    note = f"{note}; {left_out(self._left_out)}"
+                    result = replace(result, distrusted=tuple(self._left_out))
+                    self._left_out = []
         message = result.message or note
         return replace(result, T_world_camera=path.newest, message=message, corrections=path.corrections)
 
@@ -144,14 +180,43 @@ class BrightnessTracker:
         return frame.depth is not None and last is not None and np.array_equal(frame.depth, last)
 
     def _compare(
-        self, keyframe: BrightnessKeyframe, newest: BrightnessFrame, is_repeated: bool, path: PathDraft
-    ) -> None:
-        """Measure the newest pose by brightness alone, too, to see whether depth says the same."""
-        if newest.depth is None or newest.index == keyframe.index or not self._check.wants():
-            return
-        by_brightness = self._aligned_without_depth(keyframe, newest, path)
-        if by_brightness is not None:
-            self._check.add(newest.index, keyframe.index, path.newest, *by_brightness, is_repeated)
+        self,
+        keyframe: BrightnessKeyframe,
+        newest: BrightnessFrame,
+        best: Attempt,
+        usual_misfit: float,
+        is_repeated: bool,
+        path: PathDraft,
+    ) -> Attempt | None:
+        """Measure the newest pose by brightness alone, too, to see whether depth says the same.
+
+        Return that pose where depth contradicts it and is to be left out.
+        """
+        if newest.depth is None or newest.index == keyframe.index:
+            return None
+        is_good = best.result.converged
+        is_wanted = is_good and self._check.wants()
+        if is_good and not is_wanted and best.misfit < UNUSUAL * usual_misfit:
+            return None
+        aligned = self._align(keyframe, newest, None, path.newest, path)
+        result = self._judged(aligned, keyframe, path.newest, path)
+        if not result.converged:
+            return None
+        T_now_then = inverse(result.T_world_camera) @ path.newest
+        flow = self._aligner.flow(newest.depth.small, T_now_then)
+        if is_good:
+            is_wrong = self._depth_check.contradicts(flow, best.misfit, aligned.misfit)
+        else:
+            fits = aligned.misfit < FITS * usual_misfit
+            is_wrong = fits and self._depth_check.may_leave_out()
+        if is_wrong:
+            noted = replace(result, message=left_out([newest.index]), distrusted=(newest.index,))
+            return Attempt(noted, True, aligned.overlap, aligned.misfit)
+        if is_wanted:
+            self._check.add(
+                newest.index, keyframe.index, path.newest, result.T_world_camera, aligned.system, is_repeated
+            )
+        return None
 
     # --- without events ---
 
@@ -199,19 +264,131 @@ class BrightnessTracker:
         with_depth = [f for f in self._recent if f.depth is not None]
         if len(self._recent) < self._settings.min_frames or not with_depth:
             return None
-        middle = self._recent[len(self._recent) // 2].index
-        frame = min(with_depth, key=lambda f: abs(f.index - middle))
+        frame = self._middle(with_depth)
         assert frame.depth is not None
         T_now_then = inverse(path.newest) @ path.pose(frame.index)
         if self._aligner.flow(frame.depth.small, T_now_then) < self._settings.min_flow:
             return None
+        by_surfaces = {f.index: path.pose(f.index) for f in self._recent}
+        keyframe = self._solved_first(path)
+        flows = self._contradictions(keyframe, path)
+        if max(flows) > SMALLEST_FLOW:
+            keyframe, flows = self._without_wrong_depth(keyframe, flows, by_surfaces, path)
+        self._depth_check.begin(flows)
+        return keyframe
+
+    def _middle(self, frames: Sequence[BrightnessFrame]) -> BrightnessFrame:
+        """Return the one of some frames that is nearest to the middle of the recent ones."""
+        middle = self._recent[len(self._recent) // 2].index
+        return min(frames, key=lambda f: abs(f.index - middle))
+
+    def _solved_first(self, path: PathDraft, rounds: int = 2, fixed: int = 0) -> BrightnessKeyframe:
+        """Return a keyframe in the middle of the recent frames, image and poses solved for in turn."""
+        frame = self._middle([f for f in self._recent if f.depth is not None])
+        assert frame.depth is not None
         keyframe = self._new_keyframe(frame, np.zeros_like(frame.depth.small))
         self._solve(keyframe, path, iterations=40, is_robust=False)
-        for _ in range(2):  # image and poses in turn
+        for _ in range(rounds):
             self._solve(keyframe, path)
-            self._realign(keyframe, path)
+            self._realign(keyframe, path, fixed)
         self._solve(keyframe, path)
         return keyframe
+
+    def _contradictions(self, keyframe: BrightnessKeyframe, path: PathDraft) -> list[float]:
+        """Return the flow in pixels between each recent frame's pose and that by brightness alone."""
+        flows = [0.0]  # the keyframe's
+        for frame in self._recent:
+            if frame.depth is None or frame.index == keyframe.index:
+                continue
+            found = self._aligned_without_depth(keyframe, frame, path)
+            if found is not None:
+                T_now_then = inverse(found[0]) @ path.pose(frame.index)
+                flows.append(self._aligner.flow(frame.depth.small, T_now_then))
+        return flows
+
+    def _without_wrong_depth(
+        self,
+        keyframe: BrightnessKeyframe,
+        flows: list[float],
+        by_surfaces: dict[int, np.ndarray],
+        path: PathDraft,
+    ) -> tuple[BrightnessKeyframe, list[float]]:
+        """Leave out the depth of those recent frames without which brightness fits far better.
+
+        Return a keyframe, and the contradictions that are left.
+        """
+        recent, state = self._recent, self._aligner.random_state
+        best = _FirstImage(keyframe, recent, path, flows, self._misfit(keyframe, path), frozenset())
+        with_depth = [f.index for f in recent if f.depth is not None]
+        for number in range(1, min(len(recent) // 2, len(with_depth) - FEWEST) + 1):
+            trials = [
+                self._first_image_without(left, by_surfaces, recent, path)
+                for left in sets_to_try(with_depth, number, best.left_out)
+            ]
+            found = min(trials, key=lambda trial: trial.misfit)
+            if found.misfit < BETTER * best.misfit:
+                best = found
+            elif best.left_out:
+                break
+            if max(best.flows) < SETTLED_FLOW:
+                break
+        self._recent = best.recent
+        if not best.left_out:
+            self._aligner.random_state = state  # as if nothing had been tried
+            return keyframe, flows
+        for frame in best.recent:
+            path.replace(frame.index, best.path.pose(frame.index))
+        self._left_out = sorted(best.left_out)
+        return best.keyframe, best.flows
+
+    def _first_image_without(
+        self,
+        left: frozenset[int],
+        by_surfaces: dict[int, np.ndarray],
+        recent: list[BrightnessFrame],
+        path: PathDraft,
+    ) -> "_FirstImage":
+        """Return the first image where some frames' depth is left out."""
+        self._recent = [replace(f, depth=None) if f.index in left else f for f in recent]
+        known = self._by_depth(by_surfaces)
+        trial = PathDraft(path.trajectory)
+        trial.newest, trial.corrections = path.newest, dict(path.corrections)
+        for frame in recent:
+            trial.replace(frame.index, known.at(frame.timestamp))
+        is_first_wrong = 0 in left
+        keyframe = self._solved_first(trial, ROUNDS, fixed=-1 if is_first_wrong else 0)
+        if is_first_wrong:  # its pose is given: all others move
+            T = path.pose(0) @ inverse(trial.pose(0))
+            for frame in recent:
+                trial.replace(frame.index, T @ trial.pose(frame.index))
+        flows, misfit = self._contradictions(keyframe, trial), self._misfit(keyframe, trial)
+        return _FirstImage(keyframe, self._recent, trial, flows, misfit, left)
+
+    def _by_depth(self, by_surfaces: dict[int, np.ndarray]) -> Trajectory:
+        """Return poses of the recent frames with depth, aligned by depth alone to that in the middle."""
+        with_depth = [f for f in self._recent if f.depth is not None]
+        middle = self._middle(with_depth)
+        assert middle.depth is not None
+        nothing = np.zeros_like(middle.depth.small)
+        reference = self._aligner.with_points(self._new_keyframe(middle, nothing))
+        T_world_middle, poses = by_surfaces[middle.index], []
+        for frame in with_depth:
+            assert frame.depth is not None
+            start = inverse(T_world_middle) @ by_surfaces[frame.index]
+            if frame is not middle:  # a wrong frame before may have led astray
+                found = [self._aligner.align_depth(reference, frame.depth, T) for T in (start, np.eye(4))]
+                start, _ = min(found, key=lambda pair: mean_cost(pair[1]))
+            poses.append(T_world_middle @ start)
+        return Trajectory(np.array([f.timestamp for f in with_depth]), np.array(poses))
+
+    def _misfit(self, keyframe: BrightnessKeyframe, path: PathDraft) -> float:
+        """Return the mean misfit of recent frames aligned by brightness alone."""
+        misfits = [
+            min(self._align(keyframe, f, None, path.pose(f.index), path).misfit, self._settings.max_misfit)
+            for f in self._recent
+            if f.index != keyframe.index
+        ]
+        return float(np.mean(misfits))
 
     def _new_keyframe(self, frame: BrightnessFrame, log_brightness: np.ndarray) -> BrightnessKeyframe:
         assert frame.depth is not None
@@ -221,10 +398,10 @@ class BrightnessTracker:
             points=[], depth_points=None, next_solution=next_solution,
         )  # fmt: skip
 
-    def _realign(self, keyframe: BrightnessKeyframe, path: PathDraft) -> None:
-        """Align recent frames once more, to a better image than they were tracked with."""
+    def _realign(self, keyframe: BrightnessKeyframe, path: PathDraft, fixed: int = 0) -> None:
+        """Align recent frames once more, to a better image than they were tracked with, but a fixed one."""
         for frame in self._recent:
-            if frame.index in (0, keyframe.index):
+            if frame.index in (fixed, keyframe.index):
                 continue
             start = path.pose(frame.index)
             result = self._judged(

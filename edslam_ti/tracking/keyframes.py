@@ -5,8 +5,9 @@ Everything is relative to the keyframe; where keyframes are in the world is the 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -128,6 +129,15 @@ class KeyframeAligner:
     def camera(self) -> Camera:
         """The camera of brightness images."""
         return self._cameras[0]
+
+    @property
+    def random_state(self) -> Mapping[str, Any]:
+        """The state of the generator that chooses pixels: whoever tries something in vain puts it back."""
+        return self._random.bit_generator.state
+
+    @random_state.setter
+    def random_state(self, state: Mapping[str, Any]) -> None:
+        self._random.bit_generator.state = state
 
     # --- a keyframe's image ---
 
