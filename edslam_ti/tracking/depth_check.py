@@ -24,12 +24,7 @@ FITS = 1.6  # times the usual misfit: up to there brightness alone may stand for
 MOST_IN_A_ROW = 4  # frames left out; from then on brightness is in doubt as well
 REMEMBERED = 20  # frames
 
-# In the first frames: leaving depth out lowers the misfit of brightness in all frames at least to this share.
-BETTER = 0.8
-FEWEST = 2  # frames whose depth is kept
-SETTLED_FLOW = 0.25  # px: where no two poses are farther apart, nothing more is tried
 MOST_SETS = 21  # of frames that are tried; beyond, one frame after the other
-ROUNDS = 5  # in which images and poses are solved for: the first poses are partly of wrong depth
 
 
 def is_contradiction(flow: float, usual: float, misfit: float, misfit_without: float) -> bool:
