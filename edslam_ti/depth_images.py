@@ -34,8 +34,8 @@ SMOOTH_STEP = 0.02
 FUSED_STEP = 0.05
 
 # From that share of measured pixels on beside missing ones depth is sparse (lines of a lidar, fields of an
-# interlaced image, random pixels). Kinect-like images: 0.12, real ones 0.02.
-SPARSE_SHARE = 0.4
+# interlaced image, random pixels). Kinect-like images: 0.12, real ones 0.02, depth along edges 0.2 to 0.64.
+SPARSE_SHARE = 0.7
 # In sparse depth gaps are bridged that are as long as most of them: longer ones are holes, as windows are.
 USUAL_GAPS = 90  # percentile of their lengths
 LONGEST_GAP = 0.15  # of the image's height

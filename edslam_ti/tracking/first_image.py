@@ -2,7 +2,7 @@
 
 Image and poses are solved for in turn, from the poses that time surfaces and depth have given. Where a
 frame's pose by brightness alone is then far from that with depth, some depth is wrong, the keyframe's
-perhaps: sets of frames are tried without theirs, and that stays which brightness fits far better.
+perhaps: sets of frames are tried without theirs, until nothing contradicts and brightness fits far better.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,8 @@ from edslam_ti.trajectory import PathDraft, Trajectory
 
 BETTER = 0.8  # share of the misfit of all frames to which it falls at least where depth is left out
 FEWEST = 2  # frames whose depth is kept
-SETTLED_FLOW = 0.25  # px: where no two poses are farther apart, nothing more is tried
+MOST_LEFT_OUT = 3  # frames whose depth is not
+SETTLED_FLOW = 0.25  # px: where no pose is farther from that by brightness alone, nothing contradicts
 ROUNDS = 2  # in which images and poses are solved for
 CAREFUL_ROUNDS = 5  # the same where the first poses are partly of wrong depth
 
@@ -95,20 +96,20 @@ def _contradictions(segment: Segment, keyframe: BrightnessKeyframe, path: PathDr
 
 
 def _without_wrong_depth(found: FirstImage, by_surfaces: dict[int, np.ndarray]) -> FirstImage:
-    """Return the first image without the depth of those frames without which brightness fits far better."""
-    best, misfit = found, found.misfit()
-    with_depth = [f.index for f in found.segment.with_depth]
-    for number in range(1, min(len(found.segment.recent) // 2, len(with_depth) - FEWEST) + 1):
-        trials = [_trial(found, by_surfaces, s) for s in sets_to_try(with_depth, number, best.left_out)]
-        misfits = [trial.misfit() for trial in trials]
-        k = int(np.argmin(misfits))
-        if misfits[k] < BETTER * misfit:
-            best, misfit = trials[k], misfits[k]
-        elif best.left_out:
-            break
-        if max(best.flows) < SETTLED_FLOW:
-            break
-    return best
+    """Return the first image without the depth of the fewest frames that leave no contradiction.
+
+    Brightness must fit far better without them. Where no set of frames is such, all depth stays.
+    """
+    enough, with_depth = BETTER * found.misfit(), [f.index for f in found.segment.with_depth]
+    most, promising = min(MOST_LEFT_OUT, len(with_depth) - FEWEST), frozenset[int]()
+    for number in range(1, most + 1):
+        sets = sets_to_try(with_depth, number, promising)
+        trials = [(trial.misfit(), trial) for trial in (_trial(found, by_surfaces, s) for s in sets)]
+        settled = [t for t in trials if t[0] < enough and max(t[1].flows) < SETTLED_FLOW]
+        if settled:
+            return min(settled, key=lambda t: t[0])[1]
+        promising = min(trials, key=lambda t: t[0])[1].left_out
+    return found
 
 
 def _trial(found: FirstImage, by_surfaces: dict[int, np.ndarray], left_out: frozenset[int]) -> FirstImage:

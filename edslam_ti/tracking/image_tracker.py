@@ -43,6 +43,8 @@ from edslam_ti.tracking.tracker import Attempt, TrackingResult, best_attempt
 from edslam_ti.tracking.uncertainty import measured
 from edslam_ti.trajectory import PathDraft, Trajectory
 
+FEW_PIXELS = 0.1  # share with depth, below which it is said: filling gaps goes only so far
+
 
 @dataclass(frozen=True)
 class Starting:
@@ -94,6 +96,7 @@ class BrightnessTracker:
         self._smoother = PoseSmoother()
         self._check = ConsistencyCheck()
         self._depth_check = DepthCheck()
+        self._has_noted_depth = False
         self._last_depth: np.ndarray | None = None  # [H, W] metres, as it came
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
@@ -142,12 +145,21 @@ class BrightnessTracker:
                     distrusted = sorted(image.left_out)
                     note = f"{note}; {left_out(distrusted)}"
                     result = replace(result, distrusted=tuple(distrusted))
-        message = result.message or note
+        notes = (result.message or note, self._note_on_depth(frame))
+        message = "; ".join(text for text in notes if text)
         return replace(result, T_world_camera=path.newest, message=message, corrections=path.corrections)
 
     def consistency(self, trajectory: Trajectory) -> Consistency | None:
         """Return whether events and depth told the same motion; None: too little was compared."""
         return self._check.result(trajectory)
+
+    def _note_on_depth(self, frame: Frame) -> str:
+        """Return, once, that few pixels have depth."""
+        share = 0.0 if frame.depth is None else np.count_nonzero(frame.depth > 0) / frame.depth.size
+        if self._has_noted_depth or not 0 < share < FEW_PIXELS:
+            return ""
+        self._has_noted_depth = True
+        return f"only {100 * share:.2g} % of the pixels have depth"
 
     def _is_repeated(self, frame: Frame) -> bool:
         """Return whether a depth image is that of the frame before, to the last bit."""
