@@ -84,7 +84,7 @@ def levenberg_marquardt(
             break
         candidate_T = T @ se3_exp(step)
         candidate = linearise(candidate_T)
-        gain = 1 - _mean_cost(candidate) / _mean_cost(system)
+        gain = 1 - mean_cost(candidate) / mean_cost(system)
         if gain > 0:
             T, system, damping = candidate_T, candidate, max(damping / 5, 1e-7)
             if gain < small_gain:
@@ -96,7 +96,7 @@ def levenberg_marquardt(
     return T, system
 
 
-def _mean_cost(system: NormalEquations) -> float:
+def mean_cost(system: NormalEquations) -> float:
     """Return the cost per usable pixel, with a penalty for pixels lost from view."""
     if system.num_surface == 0:
         return np.inf

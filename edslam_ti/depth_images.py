@@ -34,6 +34,15 @@ SMOOTH_STEP = 0.02
 # Beyond this a pixel of a rendered view may lie between two surfaces. Slopes of up to 5 % a pixel are kept.
 FUSED_STEP = 0.05
 
+# From that share of measured pixels on beside missing ones depth is sparse (lines of a lidar, fields of an
+# interlaced image, random pixels). Kinect-like images: 0.12, real ones 0.02, depth along edges 0.2 to 0.64.
+SPARSE_SHARE = 0.7
+# In sparse depth gaps are bridged that are as long as most of them: longer ones are holes, as windows are.
+USUAL_GAPS = 90  # percentile of their lengths
+LONGEST_GAP = 0.15  # of the image's height
+# Two ends of a gap lie on one surface if they, or their continuations, differ by less than this share.
+BRIDGED_STEP = 0.03
+
 HOLE_WIDTH = 9  # px; narrower holes in depth are not filled
 FAR_SIDE = 90  # percentile of the depth around a hole
 BEHIND = 1.25  # times that depth is assumed in the hole: if too near, it would hide surfaces measured later
@@ -142,6 +151,101 @@ def with_holes_filled(
             gap = near & (depth[box] <= 0)
             filled[box][gap] = BEHIND * np.percentile(around, FAR_SIDE)
     return filled
+
+
+def with_gaps_filled(
+    depth: np.ndarray,  # [H, W] float32 metres, 0 = missing
+) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
+    """Return sparse depth with the gaps between measured pixels filled; dense depth comes back as it is.
+
+    Missing rows, columns or single pixels are filled along columns and rows, linearly in inverse depth, as
+    planes are. Gaps between two surfaces stay, and gaps longer than usual ones in the image.
+    """
+    measured = depth > 0
+    if not is_sparse(measured):
+        return depth
+    lengths = [_gaps(mask)[1] for mask in (measured, measured.T)]
+    usual = [np.percentile(n, USUAL_GAPS) for n in lengths if len(n)]
+    if not usual:
+        return depth
+    longest = min(int(min(usual)), int(LONGEST_GAP * depth.shape[0]))
+    with np.errstate(divide="ignore"):
+        inverse_depth = np.where(measured, np.float32(1) / depth, np.float32(0))
+    for _ in range(2):  # a grid of points becomes lines first
+        inverse_depth = _bridged(inverse_depth, longest)
+    filled = np.zeros_like(depth)
+    np.divide(np.float32(1), inverse_depth, out=filled, where=inverse_depth > 0)
+    return np.where(measured, depth, filled)
+
+
+def is_sparse(measured: np.ndarray) -> bool:  # [H, W] bool
+    """Return whether depth is missing beside so many measured pixels that it is missing everywhere."""
+    padded = np.pad(measured, 1, mode="edge")
+    inside = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    number = np.count_nonzero(measured)
+    return bool(np.count_nonzero(measured & ~inside) > SPARSE_SHARE * number)
+
+
+def _bridged(inverse_depth: np.ndarray, longest: int) -> np.ndarray:  # [H, W] 1 / m, 0 = missing
+    """Return inverse depth with gaps of up to so many pixels filled along rows and columns.
+
+    Where both directions fill a pixel, the shorter gap does.
+    """
+    across, across_length = _bridged_along_rows(inverse_depth, longest)
+    down, down_length = (a.T for a in _bridged_along_rows(np.ascontiguousarray(inverse_depth.T), longest))
+    filled = np.where(down_length < across_length, down, across)
+    both = (down_length == across_length) & (down > 0)
+    filled[both] = 0.5 * (down + across)[both]
+    return np.where(inverse_depth > 0, inverse_depth, filled)
+
+
+def _bridged_along_rows(
+    inverse_depth: np.ndarray, longest: int
+) -> tuple[np.ndarray, np.ndarray]:  # [H, W] 1 / m, 0 = not filled; [H, W] length of the gap, px
+    """Return what gaps in rows are filled with where their ends lie on one surface."""
+    width, flat = inverse_depth.shape[1], inverse_depth.ravel()
+    filled, length = np.zeros_like(flat), np.full(flat.shape, np.iinfo(np.int32).max, np.int32)
+    at, gap_lengths = _gaps(inverse_depth > 0)
+    pixels = np.flatnonzero(flat)  # measured
+    short = gap_lengths <= longest
+    at, n = at[short], gap_lengths[short]
+    first, last = pixels[at], pixels[at + 1]
+    a, b = flat[first], flat[last]
+    before, after = _slopes(flat, pixels, width)
+    is_one = np.abs(b - a) < BRIDGED_STEP * np.minimum(a, b)
+    continued = np.abs(a + before[at] * (n + 1) - b) < BRIDGED_STEP * b
+    continued &= np.abs(b - after[at + 1] * (n + 1) - a) < BRIDGED_STEP * a
+    is_one |= continued  # not so for NaN
+    first, a, b, n = first[is_one], a[is_one], b[is_one], n[is_one]
+    step = _counted(n)  # 1, 2, ... in every gap
+    target = np.repeat(first, n) + step
+    filled[target] = np.repeat(a, n) + np.repeat((b - a) / (n + 1), n) * step
+    length[target] = np.repeat(n, n)
+    return filled.reshape(inverse_depth.shape), length.reshape(inverse_depth.shape)
+
+
+def _slopes(
+    flat: np.ndarray, pixels: np.ndarray, width: int
+) -> tuple[np.ndarray, np.ndarray]:  # per pixel, of each measured pixel; NaN = no other in the row
+    """Return the slopes at measured pixels to the measured one before and to the one after, in rows."""
+    slope = np.diff(flat[pixels]) / np.diff(pixels)
+    slope = np.where(np.diff(pixels // width) == 0, slope, np.float32(np.nan)).astype(np.float32)
+    end = np.full(1, np.nan, np.float32)
+    return np.concatenate([end, slope]), np.concatenate([slope, end])
+
+
+def _gaps(measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [H, W] bool -> [N], [N]
+    """Return the gaps between measured pixels of a row: which of them each follows, and lengths in pixels."""
+    pixels = np.flatnonzero(measured)
+    missing = np.diff(pixels) - 1
+    at = np.flatnonzero((missing > 0) & (np.diff(pixels // measured.shape[1]) == 0))
+    return at, missing[at]
+
+
+def _counted(numbers: np.ndarray) -> np.ndarray:  # [N] -> [sum of them]
+    """Return 1, 2, ... up to each of the numbers, one after the other."""
+    ends = np.cumsum(numbers)
+    return np.arange(1, (ends[-1] if len(ends) else 0) + 1) - np.repeat(ends - numbers, numbers)
 
 
 def _corners(image: np.ndarray) -> list[np.ndarray]:  # four [H / 2, W / 2]

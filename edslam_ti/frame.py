@@ -7,6 +7,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import Sample
+from edslam_ti.depth_images import with_gaps_filled
 from edslam_ti.events import Events
 from edslam_ti.kernels.time_surface import count_events
 
@@ -43,6 +44,11 @@ class Frame:
     depth: np.ndarray | None  # [H, W] float32 metres, 0 = missing
     image: np.ndarray | None  # [H, W] float32 in [0, 1]; only RGB-D baselines use it
     is_held_out: bool = False  # reserved for evaluation, not used for mapping
+
+    @functools.cached_property
+    def tracked_depth(self) -> np.ndarray | None:  # [H, W] float32 metres, 0 = missing
+        """Depth as trackers see it: of sparse depth (lidar lines), gaps on one surface are filled."""
+        return None if self.depth is None else with_gaps_filled(self.depth)
 
     @functools.cached_property
     def event_counts(self) -> EventCounts:

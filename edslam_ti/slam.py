@@ -44,7 +44,11 @@ class Slam:
         self.results.append(replace(result, corrections={}))  # the trajectory holds them
         tracked = time.perf_counter()
         if self.mapper is not None:
+            if len(self.results) - 1 in result.distrusted:
+                frame = replace(frame, depth=None)
             self.mapper.update(frame, self.trajectory)  # Eq. 6-16
+            if earlier := [k for k in result.distrusted if k < len(self.results) - 1]:
+                self.mapper.forget_depth(earlier, self.trajectory)
         self.tracking_seconds += tracked - started
         self.mapping_seconds += time.perf_counter() - tracked
         return result

@@ -12,6 +12,7 @@ from edslam_ti.depth_images import (
     downscaled,
     downscaled_depth,
     is_smooth,
+    with_gaps_filled,
     with_holes_filled,
     without_depth_edges,
 )
@@ -90,3 +91,61 @@ def test_edges_are_the_pixels_on_both_sides_of_a_step() -> None:
     depth = np.array([[2.0, 2.0, 2.1, 2.1, 0.0]])
     assert beside_edges(depth, 0.04).tolist() == [[False, True, True, True, True]]
     assert beside_edges(depth, 0.06).tolist() == [[False, False, False, True, True]]
+
+
+def room(camera: Camera) -> np.ndarray:
+    """Return depth of a slanted wall with a box before it and a window in it."""
+    depth = (-2.0 / (camera.rays() @ np.array([0.6, 0.2, -0.77]))).astype(np.float32)
+    depth[30:60, 20:50] = 1.2
+    depth[60:100, 90:140] = 0
+    return depth
+
+
+ROWS, COLUMNS = np.mgrid[:120, :160]
+PATTERNS = {
+    "every second row": ROWS % 2 == 0,
+    "every eighth row": ROWS % 8 == 0,
+    "every fourth column": COLUMNS % 4 == 0,
+    "grid": (ROWS % 4 == 0) & (COLUMNS % 4 == 0),
+    "irregular rows": np.isin(
+        ROWS, [3, 5, 11, 18, 21, 27, 34, 38, 45, 51, 58, 62, 69, 75, 80, 86, 93, 99, 110]
+    ),
+    "random half": np.random.default_rng(0).random(ROWS.shape) < 0.5,
+    "random fifth": np.random.default_rng(1).random(ROWS.shape) < 0.2,
+}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_gaps_of_sparse_depth_are_filled_on_surfaces_and_nowhere_else(pattern: str) -> None:
+    camera = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+    true, is_measured = room(camera), PATTERNS[pattern]
+    depth = np.where(is_measured, true, np.float32(0))
+    filled = with_gaps_filled(depth)
+    assert filled.dtype == np.float32
+    assert (filled[is_measured] == depth[is_measured])[depth[is_measured] > 0].all()
+    is_filled = filled > 0
+    # Planes are linear in inverse depth; beside an outline a pixel may be on either side.
+    on_wall = is_filled & (true > 0)
+    assert (np.abs(filled - true)[on_wall] < 1e-4).mean() > 0.98
+    assert not (is_filled & (filled > 1.25) & (filled < 0.9 * true)).any()  # nothing hangs in the air
+    assert is_filled[true > 0].mean() > 0.75
+    assert not is_filled[70:90, 102:128].any()  # the window
+
+
+def test_dense_depth_is_not_touched() -> None:
+    camera = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+    depth = room(camera)
+    depth[np.random.default_rng(0).random(depth.shape) < 0.02] = 0  # as sensors lose single pixels
+    assert with_gaps_filled(depth) is depth
+    nothing = np.zeros_like(depth)
+    assert with_gaps_filled(nothing) is nothing
+
+
+@pytest.mark.parametrize("number", [1, 2, 40])
+def test_a_few_pixels_alone_are_not_joined(number: int) -> None:
+    depth = np.zeros((60, 80), np.float32)
+    chosen = np.random.default_rng(0).choice(depth.size, number, replace=False)
+    depth.ravel()[chosen] = np.linspace(1, 5, number)
+    filled = with_gaps_filled(depth)
+    assert (filled > 0).sum() < 60 + number
+    assert (filled[depth > 0] == depth[depth > 0]).all()

@@ -85,6 +85,30 @@ def test_mapper_gets_every_frame_after_its_pose_and_knows_what_is_held_out() -> 
     assert [held for _, _, held in seen] == [False, False, True, False]
 
 
+def test_depth_that_the_tracker_distrusts_is_kept_from_the_map() -> None:
+    depth = np.ones(CAMERA.shape, np.float32)
+    seen: list[bool] = []
+    forgotten: list[list[int]] = []
+
+    class Doubtful(Follower):
+        def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
+            result = super().track(frame, guess, trajectory)
+            return replace(result, distrusted={2: (2,), 3: (0, 1)}.get(len(trajectory), ()))
+
+    class Recorder:
+        def update(self, frame: Frame, trajectory: Trajectory) -> None:
+            seen.append(frame.depth is not None)
+
+        def forget_depth(self, frames: list[int], trajectory: Trajectory) -> None:
+            forgotten.append(frames)
+
+    slam = Slam(FrameBuilder(CAMERA), Doubtful(), Recorder(), np.eye(4))  # type: ignore[arg-type]
+    for k in range(4):
+        slam.process(Sample(0.1 * k, Events.empty(), depth=depth))
+    assert seen == [True, True, False, True]
+    assert forgotten == [[0, 1]]
+
+
 def test_mapping_while_tracking_keeps_the_tracked_poses(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:

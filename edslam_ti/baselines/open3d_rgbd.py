@@ -7,6 +7,7 @@ alone: point-to-plane alignment with projective association (Newcombe et al. 201
 so two runs agree to about a micrometre, not bit for bit.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,9 @@ class TsdfMapper:
             return
         self._volume.integrate(frame.depth, frame.image, trajectory.pose(-1))
         self._view = None
+
+    def forget_depth(self, frames: Sequence[int], trajectory: Trajectory) -> None:
+        """Leave the volume as it is: what is fused cannot be taken out. Its trackers trust all depth."""
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
         """Do nothing: there is nothing to refine."""

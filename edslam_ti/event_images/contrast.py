@@ -26,12 +26,16 @@ from edslam_ti.frame import EventCounts
 DEFAULT = 0.1  # Sec. IV-A: 0.1 synthetic, 0.2 real
 GAPS = (1, 2, 4)  # difference of the indices of a pair of images
 MAX_PAIRS = 8  # of each gap
+SIGN_PAIRS = 2  # of each gap, where only the sign is asked for: the data state the threshold
 LONGEST_PAIR = 0.3  # seconds between the two
 DARKEST, BRIGHTEST = 0.1, 0.98  # range of grey values with enough of the 8 bits and without clipping
 MIN_EVENTS = 400  # of either polarity
 HISTORY = 0.3  # seconds before a pair that are searched for the last event of a pixel
 MIN_DIFFERENCE = 0.05  # relative, of C+ and C-; smaller differences are within the errors of the estimate
 LOG_EPSILON = 0.004
+# Both thresholds are negative by so many standard deviations (at least so large a one) where events say
+# brighter and images darker.
+SURELY_INVERTED, LEAST_DEVIATION = 3.0, 0.005
 RING = 5  # px; pixels of this square around a pixel, without the inner 3 x 3, are its instruments
 
 
@@ -44,6 +48,7 @@ class ContrastThreshold:
     positive: float | None = None
     negative: float | None = None
     deviation: float | None = None  # standard deviation of `value` among the pairs of images (jackknife)
+    notes: tuple[str, ...] = ()  # what looks wrong with the events, a line each
 
     @property
     def relative(self) -> tuple[float, float]:
@@ -71,13 +76,16 @@ def contrast_threshold(
 
     The settings state the mean; the ratio C+ / C- is estimated nevertheless.
     """
-    if sequence.contrast_threshold is not None and stated is None:
-        return ContrastThreshold(sequence.contrast_threshold, "data")
-    estimate = contrast_from_images(sequence, start, end)
+    in_data = sequence.contrast_threshold if stated is None else None
+    solution = _from_images(sequence, start, end, MAX_PAIRS if in_data is None else SIGN_PAIRS)
+    notes = solution.notes if solution else ()
+    if in_data is not None:
+        return ContrastThreshold(in_data, "data", notes=notes)
+    estimate = solution.threshold if solution else None
     if stated is not None:
         positive, negative = (stated * r for r in estimate.relative) if estimate else (None, None)
-        return ContrastThreshold(stated, "settings", positive, negative)
-    return estimate or ContrastThreshold(DEFAULT, "default")
+        return ContrastThreshold(stated, "settings", positive, negative, notes=notes)
+    return estimate or ContrastThreshold(DEFAULT, "default", notes=notes)
 
 
 def contrast_from_images(
@@ -86,13 +94,54 @@ def contrast_from_images(
     end: float,
 ) -> ContrastThreshold | None:
     """Return the threshold estimated from images in [start, end]; None if they do not suffice."""
+    solution = _from_images(sequence, start, end, MAX_PAIRS)
+    return solution.threshold if solution else None
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """What images say, whether or not it can be a threshold."""
+
+    estimate: np.ndarray  # [2] C+ and C-
+    without_one: np.ndarray  # [P, 2] the same without one pair of images
+
+    @property
+    def deviations(self) -> np.ndarray:  # [2]
+        """Standard deviations of C+ and C- among the pairs of images (jackknife)."""
+        return np.sqrt((len(self.without_one) - 1) * self.without_one.var(0))
+
+    @property
+    def threshold(self) -> ContrastThreshold | None:
+        """The threshold, None where the estimate is none: not finite, or not positive."""
+        if not (np.isfinite(self.without_one).all() and (self.estimate > 0).all()):
+            return None
+        n, means = len(self.without_one), self.without_one.mean(1)
+        deviation = float(np.sqrt((n - 1) * means.var()))
+        positive, negative = (float(c) for c in self.estimate)
+        return ContrastThreshold(0.5 * (positive + negative), "images", positive, negative, deviation)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Whether polarity is inverted: both thresholds are surely negative."""
+        if not np.isfinite(self.without_one).all():
+            return ()
+        if not (self.estimate < -SURELY_INVERTED * np.maximum(self.deviations, LEAST_DEVIATION)).all():
+            return ()
+        return (
+            "polarity looks inverted: images become darker where events say brighter "
+            f"(C = {self.estimate.mean():.2f}); swap the polarity of the events",
+        )
+
+
+def _from_images(sequence: EventDepthSequence, start: float, end: float, max_pairs: int) -> _Solution | None:
+    """Return what images inside [start, end] say, None where there are too few of them or of events."""
     stamps = sequence.image_timestamps
     inside = np.nonzero((stamps >= start) & (stamps <= end))[0]
     products = []
     for gap in GAPS:
         pairs = [(a, b) for a, b in zip(inside, inside[gap:]) if stamps[b] - stamps[a] <= LONGEST_PAIR]
-        step = max(1, len(pairs) // MAX_PAIRS)
-        compared = (_products(sequence, int(a), int(b)) for a, b in pairs[::step][:MAX_PAIRS])
+        step = max(1, len(pairs) // max_pairs)
+        compared = (_products(sequence, int(a), int(b)) for a, b in pairs[::step][:max_pairs])
         products += [p for p in compared if p is not None]
     if len(products) < 2 or np.sum([p.events for p in products], 0).min() < MIN_EVENTS:
         return None
@@ -102,12 +151,7 @@ def contrast_from_images(
     )
     estimate = _solved(M.sum(0), v.sum(0))
     without_one = np.array([_solved(M.sum(0) - m, v.sum(0) - w) for m, w in zip(M, v)])
-    if not (np.isfinite(without_one).all() and (estimate > 0).all()):
-        return None
-    n, means = len(products), without_one.mean(1)
-    deviation = float(np.sqrt((n - 1) * means.var()))
-    positive, negative = (float(c) for c in estimate)
-    return ContrastThreshold(0.5 * (positive + negative), "images", positive, negative, deviation)
+    return _Solution(estimate, without_one)
 
 
 @dataclass(frozen=True)

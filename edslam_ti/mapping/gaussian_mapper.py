@@ -1,7 +1,7 @@
 """Builds the Gaussian map from events and depth, and refines poses with it (Sec. III-C to III-E)."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,6 +104,16 @@ class GaussianMapper:
             self._optimise_online(trajectory)
         self._built_on.remember(trajectory)
         self.budget.stop()
+
+    def forget_depth(self, frames: Sequence[int], trajectory: Trajectory) -> None:
+        """Remove the Gaussians from the depth of some frames, and fill the gaps from that of the others."""
+        self.gaussians.remove_frames(frames)
+        self.images.forget_depth(frames)
+        self.keyframes = [k for k in self.keyframes if k.index not in frames]
+        for k in self.images.frames:
+            depth = self.images.depth(k)
+            if depth is not None:
+                self._add_depth(depth, k, trajectory)
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
         """Refine map and poses over everything kept, with falling learning rates.

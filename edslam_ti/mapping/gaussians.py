@@ -1,7 +1,7 @@
 """The Gaussian map (Sec. III-C): parameters, activations, and an Adam optimiser that grows with it."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -166,6 +166,10 @@ class GaussianMap:
     def keep(self, mask: Tensor) -> None:
         """Keep the Gaussians where mask [N] is true."""
         self._map_rows(lambda table: table[mask])
+
+    def remove_frames(self, frames: Sequence[int]) -> None:
+        """Remove the Gaussians from the depth of some frames."""
+        self.keep(~torch.isin(self._frames, torch.tensor(list(frames), dtype=torch.int64)))
 
     @torch.no_grad()
     def move_with_frames(self, corrections: Mapping[int, np.ndarray]) -> None:  # T_new T_old^-1 by frame

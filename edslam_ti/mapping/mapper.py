@@ -1,6 +1,6 @@
 """The interface of mappers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -24,6 +24,9 @@ class Mapper(Protocol):
 
         It must not use the depth and the image of a frame with `is_held_out`.
         """
+
+    def forget_depth(self, frames: Sequence[int], trajectory: Trajectory) -> None:
+        """Take out what earlier frames' depth has added: it has turned out to be wrong."""
 
     def finish(self, trajectory: Trajectory, progress: Progress) -> None:
         """Refine the map after the last frame; may correct poses."""

@@ -4,6 +4,7 @@ Every window of a few seconds of events has one start image. Grey images, where 
 and fix the start image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -90,6 +91,12 @@ class EventImages:
         elif frame.timestamp - self._started > self._config.stretch:
             change = self._contrast_threshold * self._archive.reset()
             self._begin(index + 1, frame.timestamp, self._windows[-1].start + change)
+
+    def forget_depth(self, frames: Sequence[int]) -> None:
+        """Take frames for such without depth."""
+        for index in frames:
+            if index in self._depths:
+                self._depths[index] = None
 
     def log_brightness(self, index: int) -> np.ndarray:  # [H, W] float32
         """Return the image at a frame, corrected by its grey image if it has one."""

@@ -26,22 +26,24 @@ from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
-from edslam_ti.kernels.patch_warp import NormalEquations
 from edslam_ti.tracking.consistency import Consistency, ConsistencyCheck
+from edslam_ti.tracking.depth_check import FITS, UNUSUAL, DepthCheck, left_out
+from edslam_ti.tracking.first_image import first_image
 from edslam_ti.tracking.gaps import EventRate, bridge
 from edslam_ti.tracking.keyframes import (
-    Aligned,
     BrightnessFrame,
     BrightnessKeyframe,
-    Depth,
     KeyframeAligner,
 )
 from edslam_ti.tracking.loop_closure import OldKeyframes
 from edslam_ti.tracking.patch_tracker import BidirectionalPatchTracker
+from edslam_ti.tracking.segment import Segment
 from edslam_ti.tracking.smoothing import PoseSmoother
 from edslam_ti.tracking.tracker import Attempt, TrackingResult, best_attempt
 from edslam_ti.tracking.uncertainty import measured
 from edslam_ti.trajectory import PathDraft, Trajectory
+
+FEW_PIXELS = 0.1  # share with depth, below which it is said: filling gaps goes only so far
 
 
 @dataclass(frozen=True)
@@ -86,14 +88,15 @@ class BrightnessTracker:
         self._surface_tracker = BidirectionalPatchTracker(camera, surface_config, config, seed)
         self._change = BrightnessChange(camera.shape, *contrast.by_polarity)
         self.noisy_pixels = NoisyPixels(camera.shape)
-        self._segment_start = 0  # first frame of the segment of uninterrupted events
-        self._recent: list[BrightnessFrame] = []  # last frames of the segment
+        self._segment = Segment(self._aligner, config)
         self._state: Starting | Coasting | Tracking = Starting()
         self._old_keyframes = OldKeyframes(self._aligner, config)
         self._rate = EventRate(self._settings.silent_share, self._settings.slowing_share)
         self._usual_misfit = np.inf  # log brightness; until the first image is aligned, any is usual
         self._smoother = PoseSmoother()
         self._check = ConsistencyCheck()
+        self._depth_check = DepthCheck()
+        self._has_noted_depth = False
         self._last_depth: np.ndarray | None = None  # [H, W] metres, as it came
 
     def track(self, frame: Frame, guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
@@ -108,14 +111,19 @@ class BrightnessTracker:
         self._change.add(frame.event_counts)
         change = self.noisy_pixels.replaced(self._change.log_brightness())
         newest = self._aligner.brightness_frame(len(trajectory), frame, change)
-        self._recent = [*self._recent, newest][-self._settings.window :]
+        self._segment.add(newest)
         state = self._state
         if isinstance(state, Tracking):
+            usual_misfit = self._usual_misfit
             best = self._follow(state.keyframe, newest, guess, path)
+            path.newest = best.result.T_world_camera
+            is_repeated = self._is_repeated(frame)
+            without = self._compare(state.keyframe, newest, best, usual_misfit, is_repeated, path)
+            if without is not None:
+                newest, best = replace(newest, depth=None), without
+                self._segment.recent[-1], self._usual_misfit = newest, usual_misfit
             result = best.result
             path.newest = result.T_world_camera
-            if result.converged:
-                self._compare(state.keyframe, newest, self._is_repeated(frame), path)
             self._last_depth = frame.depth if frame.depth is not None else self._last_depth
             note = note or self._keep_up(state, newest, result.converged, best.overlap, path)
         else:
@@ -128,15 +136,30 @@ class BrightnessTracker:
             else:
                 result = self._surface_tracker.track(frame, guess, trajectory)
             path.newest = result.T_world_camera
-            if isinstance(self._state, Starting) and (keyframe := self._first_keyframe(path)) is not None:
-                note = self._relocalise(keyframe, self._state.silent_since, path)
-                self._state = Tracking(keyframe)
-        message = result.message or note
+            if isinstance(self._state, Starting) and (image := first_image(self._segment, path)) is not None:
+                self._segment = image.segment
+                self._depth_check.begin(image.flows)
+                note = self._relocalise(image.keyframe, self._state.silent_since, path)
+                self._state = Tracking(image.keyframe)
+                if image.left_out:
+                    distrusted = sorted(image.left_out)
+                    note = f"{note}; {left_out(distrusted)}"
+                    result = replace(result, distrusted=tuple(distrusted))
+        notes = (result.message or note, self._note_on_depth(frame))
+        message = "; ".join(text for text in notes if text)
         return replace(result, T_world_camera=path.newest, message=message, corrections=path.corrections)
 
     def consistency(self, trajectory: Trajectory) -> Consistency | None:
         """Return whether events and depth told the same motion; None: too little was compared."""
         return self._check.result(trajectory)
+
+    def _note_on_depth(self, frame: Frame) -> str:
+        """Return, once, that few pixels have depth."""
+        share = 0.0 if frame.depth is None else np.count_nonzero(frame.depth > 0) / frame.depth.size
+        if self._has_noted_depth or not 0 < share < FEW_PIXELS:
+            return ""
+        self._has_noted_depth = True
+        return f"only {100 * share:.2g} % of the pixels have depth"
 
     def _is_repeated(self, frame: Frame) -> bool:
         """Return whether a depth image is that of the frame before, to the last bit."""
@@ -144,14 +167,43 @@ class BrightnessTracker:
         return frame.depth is not None and last is not None and np.array_equal(frame.depth, last)
 
     def _compare(
-        self, keyframe: BrightnessKeyframe, newest: BrightnessFrame, is_repeated: bool, path: PathDraft
-    ) -> None:
-        """Measure the newest pose by brightness alone, too, to see whether depth says the same."""
-        if newest.depth is None or newest.index == keyframe.index or not self._check.wants():
-            return
-        by_brightness = self._aligned_without_depth(keyframe, newest, path)
-        if by_brightness is not None:
-            self._check.add(newest.index, keyframe.index, path.newest, *by_brightness, is_repeated)
+        self,
+        keyframe: BrightnessKeyframe,
+        newest: BrightnessFrame,
+        best: Attempt,
+        usual_misfit: float,
+        is_repeated: bool,
+        path: PathDraft,
+    ) -> Attempt | None:
+        """Measure the newest pose by brightness alone, too, to see whether depth says the same.
+
+        Return that pose where depth contradicts it and is to be left out.
+        """
+        if newest.depth is None or newest.index == keyframe.index:
+            return None
+        is_good = best.result.converged
+        is_wanted = is_good and self._check.wants()
+        if is_good and not is_wanted and best.misfit < UNUSUAL * usual_misfit:
+            return None
+        aligned = self._segment.align(keyframe, newest, None, path.newest, path)
+        result = self._segment.judged(aligned, keyframe, path.newest, path)
+        if not result.converged:
+            return None
+        T_now_then = inverse(result.T_world_camera) @ path.newest
+        flow = self._aligner.flow(newest.depth.small, T_now_then)
+        if is_good:
+            is_wrong = self._depth_check.contradicts(flow, best.misfit, aligned.misfit)
+        else:
+            fits = aligned.misfit < FITS * usual_misfit
+            is_wrong = fits and self._depth_check.may_leave_out()
+        if is_wrong:
+            noted = replace(result, message=left_out([newest.index]), distrusted=(newest.index,))
+            return Attempt(noted, True, aligned.overlap, aligned.misfit)
+        if is_wanted:
+            self._check.add(
+                newest.index, keyframe.index, path.newest, result.T_world_camera, aligned.system, is_repeated
+            )
+        return None
 
     # --- without events ---
 
@@ -175,9 +227,8 @@ class BrightnessTracker:
         self._begin_segment(index)
 
     def _begin_segment(self, index: int) -> None:
-        self._segment_start = index
+        self._segment.begin(index)
         self._change.reset()
-        self._recent = []
 
     def _coast(self, newest: BrightnessFrame, guess: np.ndarray, path: PathDraft) -> TrackingResult:
         """Align depth alone to the last keyframe's."""
@@ -194,45 +245,6 @@ class BrightnessTracker:
 
     # --- the first image of a segment ---
 
-    def _first_keyframe(self, path: PathDraft) -> BrightnessKeyframe | None:
-        """Return a keyframe with the segment's first image, None until the scene has moved enough."""
-        with_depth = [f for f in self._recent if f.depth is not None]
-        if len(self._recent) < self._settings.min_frames or not with_depth:
-            return None
-        middle = self._recent[len(self._recent) // 2].index
-        frame = min(with_depth, key=lambda f: abs(f.index - middle))
-        assert frame.depth is not None
-        T_now_then = inverse(path.newest) @ path.pose(frame.index)
-        if self._aligner.flow(frame.depth.small, T_now_then) < self._settings.min_flow:
-            return None
-        keyframe = self._new_keyframe(frame, np.zeros_like(frame.depth.small))
-        self._solve(keyframe, path, iterations=40, is_robust=False)
-        for _ in range(2):  # image and poses in turn
-            self._solve(keyframe, path)
-            self._realign(keyframe, path)
-        self._solve(keyframe, path)
-        return keyframe
-
-    def _new_keyframe(self, frame: BrightnessFrame, log_brightness: np.ndarray) -> BrightnessKeyframe:
-        assert frame.depth is not None
-        next_solution = self._recent[-1].index + self._settings.solve_interval
-        return BrightnessKeyframe(
-            frame.index, frame.change, frame.depth, frame.depth, log_brightness,
-            points=[], depth_points=None, next_solution=next_solution,
-        )  # fmt: skip
-
-    def _realign(self, keyframe: BrightnessKeyframe, path: PathDraft) -> None:
-        """Align recent frames once more, to a better image than they were tracked with."""
-        for frame in self._recent:
-            if frame.index in (0, keyframe.index):
-                continue
-            start = path.pose(frame.index)
-            result = self._judged(
-                self._align(keyframe, frame, frame.depth, start, path), keyframe, start, path
-            )
-            if result.converged:
-                path.replace(frame.index, result.T_world_camera)
-
     def _relocalise(self, keyframe: BrightnessKeyframe, silent_since: int, path: PathDraft) -> str:
         """Move the segment to where an older keyframe shows it to be; return what happened."""
         found = self._old_keyframes.relocalised(keyframe, path)
@@ -240,7 +252,7 @@ class BrightnessTracker:
             return "no place recognised" if len(self._old_keyframes) else "first brightness image"
         T_world_camera, message = found
         correction = T_world_camera @ inverse(path.pose(keyframe.index))
-        bridge(path, silent_since - 1, self._segment_start, correction)
+        bridge(path, silent_since - 1, self._segment.start, correction)
         return message
 
     # --- frame by frame ---
@@ -251,8 +263,8 @@ class BrightnessTracker:
         """Return the better alignment: from the predicted pose and, where that is in doubt, from the last."""
 
         def attempt(start: np.ndarray) -> Attempt:
-            aligned = self._align(keyframe, frame, frame.depth, start, path)
-            result = self._judged(aligned, keyframe, guess, path)
+            aligned = self._segment.align(keyframe, frame, frame.depth, start, path)
+            result = self._segment.judged(aligned, keyframe, guess, path)
             is_sure = result.converged and aligned.misfit < self._settings.doubtful * self._usual_misfit
             return Attempt(result, is_sure, aligned.overlap, aligned.misfit)
 
@@ -261,27 +273,6 @@ class BrightnessTracker:
             usual = self._usual_misfit if np.isfinite(self._usual_misfit) else best.misfit
             self._usual_misfit = 0.8 * usual + 0.2 * best.misfit
         return best
-
-    def _align(
-        self,
-        keyframe: BrightnessKeyframe,
-        frame: BrightnessFrame,
-        depth: Depth | None,  # what is aligned beside the image
-        start: np.ndarray,  # [4, 4] T_world_camera
-        path: PathDraft,
-    ) -> Aligned:
-        T_keyframe_world = inverse(path.pose(keyframe.index))
-        return self._aligner.align(keyframe, keyframe.image_at(frame), depth, T_keyframe_world @ start)
-
-    def _judged(
-        self, aligned: Aligned, keyframe: BrightnessKeyframe, guess: np.ndarray, path: PathDraft
-    ) -> TrackingResult:
-        """Return the pose, or the guess and a reason where it cannot be trusted."""
-        problem = aligned.problem(self._config)
-        T = guess if problem else path.pose(keyframe.index) @ aligned.T_keyframe_camera
-        measurement = None if problem else measured(keyframe.index, aligned.last)
-        quality = aligned.quality(self._config)
-        return TrackingResult(T, not problem, quality, problem, measurement=measurement)
 
     def _keep_up(
         self, state: Tracking, newest: BrightnessFrame, is_good: bool, overlap: float, path: PathDraft
@@ -301,11 +292,11 @@ class BrightnessTracker:
         if is_new:
             if keyframe.is_new_place:
                 self._old_keyframes.add(keyframe)
-            keyframe = self._new_keyframe(newest, keyframe.image_at(newest))
+            keyframe = self._segment.new_keyframe(newest, keyframe.image_at(newest))
             self._state = Tracking(keyframe)
         elif newest.index < keyframe.next_solution:
             return ""
-        self._solve(keyframe, path)
+        self._segment.solve(keyframe, path)
         keyframe.next_solution = newest.index + max(
             self._settings.solve_interval, newest.index - keyframe.index
         )
@@ -313,40 +304,11 @@ class BrightnessTracker:
 
     def _settle(self, keyframe: BrightnessKeyframe, newest: BrightnessFrame, path: PathDraft) -> None:
         """Correct the poses between the last two frames with depth, now that both ends are known."""
-        frames = self._since_depth(newest)
+        frames = self._segment.since_depth(newest)
         if len(frames) < 3:
             return
-        self._solve(keyframe, path)
-        by_brightness = [self._aligned_without_depth(keyframe, f, path) for f in frames]
+        self._segment.solve(keyframe, path)
+        by_brightness = [self._segment.without_depth(keyframe, f, path) for f in frames]
         known = [a for a in by_brightness if a is not None]
         if len(known) == len(frames):
-            self._smoother.settle(frames, known, self._recent, path)
-
-    def _since_depth(self, newest: BrightnessFrame) -> list[BrightnessFrame]:
-        """Return the frames from the last one with depth up to a new one."""
-        for k in range(len(self._recent) - 2, -1, -1):
-            if self._recent[k].depth is not None:
-                return self._recent[k:]
-        return [newest]
-
-    def _aligned_without_depth(
-        self, keyframe: BrightnessKeyframe, frame: BrightnessFrame, path: PathDraft
-    ) -> tuple[np.ndarray, NormalEquations] | None:
-        """Return the pose by brightness alone and how well it is determined, or None."""
-        T = path.pose(frame.index)
-        aligned = self._align(keyframe, frame, None, T, path)
-        if frame.index == keyframe.index:
-            return T, aligned.system
-        result = self._judged(aligned, keyframe, T, path)
-        return (result.T_world_camera, aligned.system) if result.converged else None
-
-    def _solve(
-        self, keyframe: BrightnessKeyframe, path: PathDraft, iterations: int = 8, is_robust: bool = True
-    ) -> None:
-        """Solve for the keyframe's image from recent frames, and choose its pixels to align."""
-        others = [f for f in self._recent if f.index != keyframe.index]
-        count = min(len(others), self._settings.observations)
-        frames = [others[round(k)] for k in np.linspace(0, len(others) - 1, count)]
-        T_world_keyframe = path.pose(keyframe.index)
-        poses = [inverse(path.pose(f.index)) @ T_world_keyframe for f in frames]
-        self._aligner.solve(keyframe, frames, poses, iterations, is_robust)
+            self._smoother.settle(frames, known, self._segment.recent, path)

@@ -5,8 +5,9 @@ All poses here are relative to the keyframe; the tracker knows where keyframes a
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -129,6 +130,15 @@ class KeyframeAligner:
         """The camera of brightness images."""
         return self._cameras[0]
 
+    @property
+    def random_state(self) -> Mapping[str, Any]:
+        """The state of the generator that chooses pixels: whoever tries something in vain puts it back."""
+        return self._random.bit_generator.state
+
+    @random_state.setter
+    def random_state(self, state: Mapping[str, Any]) -> None:
+        self._random.bit_generator.state = state
+
     # --- a keyframe's image ---
 
     def brightness_frame(
@@ -140,7 +150,7 @@ class KeyframeAligner:
         """Return the measurements up to a frame, at the size of brightness images."""
         for _ in range(self._level):
             change = downscaled(change)
-        depth = None if frame.depth is None else self._reduced(frame.depth)
+        depth = None if frame.tracked_depth is None else self._reduced(frame.tracked_depth)
         return BrightnessFrame(index, frame.timestamp, change, depth)
 
     def _reduced(self, depth: np.ndarray) -> Depth:  # [H, W] metres

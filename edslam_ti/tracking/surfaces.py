@@ -34,7 +34,8 @@ class SurfaceFrame:
     def __init__(self, frame: Frame, surface: np.ndarray) -> None:
         """`surface` [H, W] float32 in [0, 1]."""
         self.frame = frame
-        depth = frame.depth if frame.depth is not None else np.zeros(frame.camera.shape, np.float32)
+        depth = frame.tracked_depth
+        depth = depth if depth is not None else np.zeros(frame.camera.shape, np.float32)
         self._pyramid = [PyramidLevel(frame.camera, surface, depth)]
 
     def level(self, k: int) -> PyramidLevel:

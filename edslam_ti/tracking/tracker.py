@@ -30,6 +30,7 @@ class TrackingResult:
     # Better poses T_world_camera [4, 4] of earlier frames, by index.
     corrections: Mapping[int, np.ndarray] = field(default_factory=dict)
     measurement: Measurement | None = None  # None: the pose is given or predicted, not measured
+    distrusted: tuple[int, ...] = ()  # frames, this one or earlier ones, whose depth is wrong
 
 
 @dataclass(frozen=True)

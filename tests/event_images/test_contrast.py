@@ -1,5 +1,6 @@
 """The contrast threshold from a few grey images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from sequences import record_tiny_room
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.event_images.contrast import contrast_from_images, contrast_threshold
+from edslam_ti.events import Events
 
 
 @pytest.mark.slow
@@ -50,3 +52,49 @@ def test_settings_state_the_mean_and_images_the_ratio(tmp_path: Path) -> None:
     assert (found.value, found.source) == (0.5, "settings")
     assert 0.5 * (positive + negative) == pytest.approx(1)
     assert positive / negative == pytest.approx(0.2 / 0.26, rel=0.05)
+
+
+def inverted(sequence: EventDepthSequence, monkeypatch: pytest.MonkeyPatch) -> EventDepthSequence:
+    """Return the sequence with polarity of its events swapped."""
+    as_is = sequence.events
+
+    def swapped(start: float, end: float) -> Events:
+        events = as_is(start, end)
+        return replace(events, polarity=-events.polarity)
+
+    monkeypatch.setattr(sequence, "events", swapped)
+    return sequence
+
+
+def test_inverted_polarity_is_named_wherever_the_threshold_comes_from(
+    tiny_sequence: EventDepthSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert contrast_threshold(None, tiny_sequence, 0.0, 1.0).notes == ()
+    assert contrast_threshold(0.1, tiny_sequence, 0.0, 1.0).notes == ()
+    sequence = inverted(tiny_sequence, monkeypatch)
+    for stated, is_in_data, source in (
+        (None, True, "data"),
+        (0.2, True, "settings"),
+        (None, False, "default"),
+    ):
+        if not is_in_data:
+            monkeypatch.setattr(sequence, "contrast_threshold", None)
+        found = contrast_threshold(stated, sequence, 0.0, 1.0)
+        assert found.source == source
+        (note,) = found.notes
+        assert note.startswith("polarity looks inverted")
+        assert "C = -0.1" in note
+        assert found.value > 0  # it is said, not applied
+
+
+def test_random_polarity_is_not_called_inverted(
+    tiny_sequence: EventDepthSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    as_is, random = tiny_sequence.events, np.random.default_rng(0)
+
+    def shuffled(start: float, end: float) -> Events:
+        events = as_is(start, end)
+        return replace(events, polarity=random.permutation(events.polarity))
+
+    monkeypatch.setattr(tiny_sequence, "events", shuffled)
+    assert contrast_threshold(None, tiny_sequence, 0.0, 1.0).notes == ()

@@ -1,0 +1,77 @@
+"""Depth images that contradict events and their neighbours: files swapped, or of another time.
+
+Brightness alone, and brightness together with depth, give a frame two poses. Where depth is that of the
+frame they agree: between them what is in view moves by a few hundredths of a pixel (simulated rooms), by
+tenths with a sensor's noise. Depth of another time pulls the second pose to where it was taken, away from
+the first, and the image then fits worse. Faults of all frames (clocks, focal length) make differences usual:
+consistency.py is for them.
+"""
+
+import itertools
+import math
+from collections import deque
+
+import numpy as np
+
+# A frame's depth contradicts where both poses are so far apart, and the image fits worse with depth,
+SMALLEST_FLOW = 0.6  # px of brightness images, at least
+TIMES_USUAL = 5.0  # and so many times what is usual,
+WORSE = 1.1  # and the misfit of brightness with depth is so many times that without,
+FAR_FLOW, FAR_TIMES_USUAL = 1.2, 20.0  # or merely not smaller, if the poses are as far apart as that.
+
+UNUSUAL = 1.15  # times the usual misfit, from which on a frame is looked at
+FITS = 1.6  # times the usual misfit: up to there brightness alone may stand for a frame lost with depth
+MOST_IN_A_ROW = 4  # frames left out; from then on brightness is in doubt as well
+REMEMBERED = 20  # frames
+
+MOST_SETS = 21  # of frames that are tried; beyond, one frame after the other
+
+
+def is_contradiction(flow: float, usual: float, misfit: float, misfit_without: float) -> bool:
+    """Return whether depth is of another time, by the flow between both poses and by both misfits."""
+    if flow > max(FAR_FLOW, FAR_TIMES_USUAL * usual):
+        return misfit > misfit_without
+    return flow > max(SMALLEST_FLOW, TIMES_USUAL * usual) and misfit > WORSE * misfit_without
+
+
+def sets_to_try(frames: list[int], number: int, left_out: frozenset[int]) -> list[frozenset[int]]:
+    """Return sets of so many frames to leave out: all, or where they are too many, those with `left_out`."""
+    if math.comb(len(frames), number) <= MOST_SETS:
+        return [frozenset(chosen) for chosen in itertools.combinations(frames, number)]
+    return [left_out | {k} for k in frames if k not in left_out]
+
+
+class DepthCheck:
+    """Judges the depth of one frame after the other."""
+
+    def __init__(self) -> None:
+        self._flows: deque[float] = deque(maxlen=REMEMBERED)  # px, of frames whose depth was kept
+        self._left_out = 0  # in a row
+
+    def begin(self, flows: list[float]) -> None:
+        """Take what is usual in the frames that a first image is made of."""
+        self._flows.clear()
+        self._flows.extend(flows)
+        self._left_out = 0
+
+    def contradicts(self, flow: float, misfit: float, misfit_without: float) -> bool:
+        """Return whether a frame's depth is to be left out."""
+        usual = float(np.median(self._flows)) if self._flows else 0.0
+        if is_contradiction(flow, usual, misfit, misfit_without) and self.may_leave_out():
+            return True
+        self._left_out = 0
+        self._flows.append(flow)
+        return False
+
+    def may_leave_out(self) -> bool:
+        """Return whether one more frame may be left out, and count it."""
+        self._left_out += 1
+        return self._left_out <= MOST_IN_A_ROW
+
+
+def left_out(indices: list[int]) -> str:
+    """Return the note about frames whose depth is left out."""
+    if len(indices) == 1:
+        return f"depth of frame {indices[0]} contradicts events and its neighbours: left out"
+    named = ", ".join(map(str, indices[:-1])) + f" and {indices[-1]}"
+    return f"depth of frames {named} contradicts events and its neighbours: left out"
