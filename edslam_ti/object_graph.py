@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.lib.array_utils import byte_bounds
 from torch import Tensor
 
 from edslam_ti.errors import DataError
@@ -151,7 +150,7 @@ class _Writer:
             return ["set", self._values(list(value), way)]
         if kind is np.ndarray:
             if value.size:
-                self._memory.append((*byte_bounds(value), value.flags.writeable, way))
+                self._memory.append((*_bounds(value), value.flags.writeable, way))
             return ["array", *self._array(value)]
         if isinstance(value, np.generic):
             return ["scalar", *self._array(np.asarray(value))]
@@ -188,13 +187,21 @@ class _Writer:
             raise StateError(f"{way}: a tensor in mid step, or of a GPU, is no state that can be kept")
         array = value.detach().numpy()
         if array.size:
-            self._memory.append((*byte_bounds(array), True, way))
+            self._memory.append((*_bounds(array), True, way))
         return ["tensor", value.requires_grad, *self._array(array)]
 
     def _adam(self, value: torch.optim.Adam, way: str) -> list[Any]:
         state = [[self._value(p, way), self._value(s, f"{way}.state")] for p, s in value.state.items()]
         groups = [self._value(group, f"{way}.group") for group in value.param_groups]
         return ["adam", self._value(value.defaults, way), groups, state]
+
+
+def _bounds(array: np.ndarray) -> tuple[int, int]:
+    """Return the addresses of an array's first byte and behind its last one."""
+    start = end = array.__array_interface__["data"][0]
+    for count, stride in zip(array.shape, array.strides):
+        start, end = start + min(0, (count - 1) * stride), end + max(0, (count - 1) * stride)
+    return start, end + array.itemsize
 
 
 # --- and back ---
