@@ -104,10 +104,21 @@ class _Writer:
         self._nodes: list[list[Any]] = []
         self._arrays: list[np.ndarray] = []
         self._known: dict[int, tuple[int, Any]] = {}  # node by id, and the object, so that ids stay unique
-        self._memory: dict[int, Any] = {}  # arrays by the address of what they are views of
+        self._memory: list[tuple[int, int, bool, str]] = []  # start, end, can be written, way of each array
 
     def written(self, root: Any) -> Graph:
-        return Graph(self._value(root, "root"), self._nodes, self._arrays)
+        graph = Graph(self._value(root, "root"), self._nodes, self._arrays)
+        self._check_memory()
+        return graph
+
+    def _check_memory(self) -> None:
+        """Views of one memory would be written as arrays of their own, and part when one is changed."""
+        last, can_be_written, whose = 0, False, ""
+        for start, end, writeable, way in sorted(self._memory):
+            if start < last and (writeable or can_be_written):
+                raise StateError(f"{way} is in the memory of {whose}: only one may be held")
+            if end > last:
+                last, can_be_written, whose = end, writeable, way
 
     def _value(self, value: Any, way: str) -> Any:
         """Return a value as JSON; `way` names it in messages."""
@@ -138,7 +149,8 @@ class _Writer:
         if kind is set:
             return ["set", self._values(list(value), way)]
         if kind is np.ndarray:
-            self._check_owner(value, way)
+            if value.size:
+                self._memory.append((*_bounds(value), value.flags.writeable, way))
             return ["array", *self._array(value)]
         if isinstance(value, np.generic):
             return ["scalar", *self._array(np.asarray(value))]
@@ -170,29 +182,26 @@ class _Writer:
         self._arrays.append(value if value.flags.c_contiguous else np.ascontiguousarray(value))
         return [len(self._arrays) - 1, order]
 
-    def _check_owner(self, value: np.ndarray, way: str) -> None:
-        """Views of one array would be written as arrays of their own, and part when one is changed."""
-        while isinstance(value.base, np.ndarray):
-            value = value.base
-        if value.size:
-            self._check_memory(value.__array_interface__["data"][0], way)
-
-    def _check_memory(self, address: int, way: str) -> None:
-        if address in self._memory:
-            raise StateError(f"{way} is in the memory of {self._memory[address]}: only one may be held")
-        self._memory[address] = way
-
     def _tensor(self, value: Tensor, way: str) -> list[Any]:
         if value.grad_fn is not None or value.grad is not None or value.device.type != "cpu":
             raise StateError(f"{way}: a tensor in mid step, or of a GPU, is no state that can be kept")
-        if value.numel():
-            self._check_memory(value.untyped_storage().data_ptr(), way)
-        return ["tensor", value.requires_grad, *self._array(value.detach().numpy())]
+        array = value.detach().numpy()
+        if array.size:
+            self._memory.append((*_bounds(array), True, way))
+        return ["tensor", value.requires_grad, *self._array(array)]
 
     def _adam(self, value: torch.optim.Adam, way: str) -> list[Any]:
         state = [[self._value(p, way), self._value(s, f"{way}.state")] for p, s in value.state.items()]
         groups = [self._value(group, f"{way}.group") for group in value.param_groups]
         return ["adam", self._value(value.defaults, way), groups, state]
+
+
+def _bounds(array: np.ndarray) -> tuple[int, int]:
+    """Return the addresses of an array's first byte and behind its last one."""
+    start = end = array.__array_interface__["data"][0]
+    for count, stride in zip(array.shape, array.strides):
+        start, end = start + min(0, (count - 1) * stride), end + max(0, (count - 1) * stride)
+    return start, end + array.itemsize
 
 
 # --- and back ---

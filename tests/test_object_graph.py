@@ -171,11 +171,18 @@ def test_what_is_no_state_is_refused_with_the_way_to_it(value: Any) -> None:
         to_graph({"a": [value]}, {})
 
 
-def test_two_views_of_one_memory_are_refused() -> None:
+def test_what_can_be_written_through_another_array_is_refused() -> None:
     base = np.arange(6)
-    for pair in ([base, base[2:]], [base[:2], base[2:]], [base, torch.from_numpy(base)]):
+    for pair in ([base, base[2:]], [base[3:], base], [base, torch.from_numpy(base)]):
         with pytest.raises(StateError, match="is in the memory of"):
             to_graph(pair, {})
+
+
+def test_parts_of_one_array_come_back_as_arrays_of_their_own() -> None:
+    base = np.arange(6)
+    np.testing.assert_array_equal(copied([base[:2], base[2:]])[1], base[2:])
+    base.flags.writeable = False
+    np.testing.assert_array_equal(copied([base, base[2:]])[1], base[2:])
 
 
 @pytest.mark.parametrize(

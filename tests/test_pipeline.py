@@ -10,6 +10,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from sequences import settings
 from edslam_ti import pipeline
 from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
-from edslam_ti.datasets import Sample
+from edslam_ti.datasets import Sample, SampledSequence
 from edslam_ti.errors import DataError
 from edslam_ti.evaluation import trajectories as evaluation
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
@@ -624,21 +625,21 @@ def test_reader_that_goes_away_does_not_end_the_run(
 
 
 def test_more_than_a_tenth_of_lost_frames_is_exit_code_3(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Neither depth nor events for a quarter of a second.
-    dark = sorted((recording / "depth").iterdir())[8:13]
-    start, end = (int(path.stem[5:]) / 1000 for path in (dark[0], dark[-1]))
-    for path in dark:
-        cv2.imwrite(str(path), np.zeros((80, 120), np.uint16))
-    (events_file,) = recording.glob("event_threshold_*/*.npy")
-    events = np.load(events_file)
-    np.save(events_file, events[(events[:, 2] < start - 0.05) | (events[:, 2] > end)])
-    config = config_for(recording, tmp_path, mapping={"enabled": False})
-    with pytest.raises(SystemExit) as stop:
-        launch(lambda: require_tracked(run(config)))
-    assert stop.value.code == 3
-    assert "5 of 14 frames were lost" in capsys.readouterr().err
+    process: Callable[..., TrackingResult] = Slam.process
+
+    def processed(self: Slam, sample: Sample, is_held_out: bool = False) -> TrackingResult:
+        result = process(self, sample, is_held_out)
+        if len(self.results) > 12:
+            self.results[-1] = replace(self.results[-1], converged=False)
+        return result
+
+    monkeypatch.setattr(Slam, "process", processed)
+    code, message, folder = ended(config_for(tiny_folder, tmp_path, mapping={"enabled": False}), capsys)
+    assert code == 3
+    assert "2 of 14 frames were lost" in message
+    assert state_of(folder) == "finished"
 
 
 @pytest.mark.parametrize("name", ["depth/frame000400.png", "images/frame000400.png"])
@@ -654,15 +655,20 @@ def test_unreadable_image_in_the_middle_is_a_frame_without_it(
 
 
 def test_many_unreadable_frames_in_a_row_end_the_run(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "MOST_UNREADABLE", 4)
-    for path in sorted((recording / "depth").iterdir())[5:9]:
-        path.write_bytes(path.read_bytes()[:300])
-    config = config_for(recording, tmp_path, mapping={"enabled": False})
-    with pytest.raises(DataError, match="4 frames in a row cannot be read"):
-        quiet_run(config)
-    assert (tmp_path / "event_replica/changed/ed_slam/latest/trajectory_tum.txt").is_file()
+    read = SampledSequence.as_far_as_readable
+
+    def damaged(self: SampledSequence, k: int) -> tuple[Sample, str]:
+        sample, problem = read(self, k)
+        return (replace(sample, depth=None), "damaged") if k > 2 else (sample, problem)
+
+    monkeypatch.setattr(SampledSequence, "as_far_as_readable", damaged)
+    with pytest.raises(DataError, match="10 frames in a row cannot be read; the last: damaged"):
+        quiet_run(config_for(tiny_folder, tmp_path, mapping={"enabled": False}))
+    latest = tmp_path / "event_replica/tiny/ed_slam/latest"
+    assert len(read_tum(latest / "trajectory_tum.txt")) == 12
+    assert "frame 12 at" in (latest / "log.txt").read_text()
 
 
 # --- what shows before the first frame ---

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from edslam_ti.depth_images import without_depth_edges
-from edslam_ti.errors import LONGEST_MESSAGE, EdSlamError, plain
+from edslam_ti.errors import LONGEST_MESSAGE, plain
 from edslam_ti.evaluation.images import LinearFit
 from edslam_ti.interruption import Interruption, Stopped
 from edslam_ti.mapping.mapper import Mapper
@@ -33,7 +33,7 @@ MESH_ALPHA = 0.5  # pixels less opaque, which have no median depth, are left out
 MESH_STEP, MESH_TURN = 0.1, 5.0  # metres, degrees between the views that are fused
 VIDEO_FPS = 15.0
 # An input that is missing or cannot be used, or numbers without a solution: the others stand.
-MISSING = (EdSlamError, FileNotFoundError, np.linalg.LinAlgError)
+MISSING = (ValueError, FileNotFoundError)
 NO_VIEWS = {kind: ViewNumbers(0, None, None, None) for kind in KINDS}
 
 T = TypeVar("T")
