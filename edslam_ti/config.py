@@ -254,6 +254,11 @@ class Config(Stage):
     """C in Eq. 11. Omitted: the data set's own (camera.json), else estimated from its images, else 0.1;
     events alone do not determine it, so log brightness is then known up to a factor. Given: the mean of C+
     and C-, whose ratio is estimated from the images, if there are any."""
+    depth_rate: float | None = Field(None, ge=1e-3, le=1e5)
+    """Hz, of depth images that are numbered by index, not by milliseconds (event_replica). Omitted: that in
+    camera.json."""
+    image_rate: float | None = Field(None, ge=1e-3, le=1e5)
+    """The same of grey images."""
     max_interval: float = Field(0.05, ge=1e-3)
     """Longest time between tracked frames in seconds; frames without depth fill longer intervals."""
     out: Path = Path("results")

@@ -139,6 +139,8 @@ def _prepare(config: Config, console: Console) -> tuple[Viewer, Run]:
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     contrast = contrast_of(config, sequence, samples)
     slam = make_slam(config, sequence, samples, contrast)
+    for text in contrast.notes:
+        sequence.note(text)
     held_out = held_out_frames(samples, config.evaluation.hold_out_every)
     state = Run(config, sequence, samples, slam, held_out, contrast)
     camera, (first, last) = sequence.camera, samples.timestamps[[0, -1]]
@@ -150,6 +152,8 @@ def _prepare(config: Config, console: Console) -> tuple[Viewer, Run]:
         f"{camera.width}x{camera.height}, {last - first:.2f} s, {len(samples)} frames, "
         f"method {config.method} on {config.device}",
     )
+    for text in sequence.notes:
+        say(console, plain(text))
     if config.mapping.enabled:
         _check_truth_of_views(state, console)
     return viewer, state

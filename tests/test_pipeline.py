@@ -414,6 +414,30 @@ def test_map_without_a_surface_keeps_its_other_results(tiny_folder: Path, tmp_pa
     assert "mesh.ply: no surface" in (folder / "log.txt").read_text()
 
 
+@pytest.mark.slow
+def test_inverted_polarity_is_told_with_the_results(recording: Path, tmp_path: Path) -> None:
+    (events_file,) = recording.glob("event_threshold_*/*.npy")
+    events = np.load(events_file)
+    events[:, 3] = 1 - events[:, 3] if events[:, 3].min() == 0 else -events[:, 3]
+    np.save(events_file, events)
+    folder = quiet_run(config_for(recording, tmp_path, mapping={"enabled": False}))
+    [note] = metrics_of(folder)["data_notes"]
+    assert note.startswith("polarity looks inverted")
+
+
+@pytest.mark.slow
+def test_a_view_without_an_image_is_left_out_alone(recording: Path, tmp_path: Path) -> None:
+    views = quiet_run(config_for(recording, tmp_path / "whole")) / "renders/views.csv"
+    whole = [row.split(",") for row in views.read_text().splitlines() if row.startswith("held out")]
+    assert len(whole) > 1
+    (recording / f"images/frame{round(1000 * float(whole[0][1])):06d}.png").unlink()
+    views = quiet_run(config_for(recording, tmp_path / "less")) / "renders/views.csv"
+    less = [row.split(",") for row in views.read_text().splitlines() if row.startswith("held out")]
+    assert [row[1] for row in less] == [row[1] for row in whole]
+    assert less[0][2] == ""
+    assert float(less[1][2]) > 10
+
+
 # --- runs that end early ---
 
 

@@ -78,7 +78,9 @@ def _make_builtin(scene: str) -> Path:
 FORMATS: dict[str, Format] = {
     "event_replica": Format(
         "EventReplica's layout, with event_threshold_<C>/gray_events_data.npy",
-        lambda folder, config: EventReplicaSequence(folder, config.contrast_threshold),
+        lambda folder, config: EventReplicaSequence(
+            folder, config.contrast_threshold, config.depth_rate, config.image_rate
+        ),
         is_event_replica,
     ),
     "rpg": Format(
@@ -127,6 +129,12 @@ def open_sequence(config: Config) -> EventDepthSequence:
     Raises what `find_sequence` raises, and `DataError` or `FileNotFoundError` for files that cannot be used.
     """
     found = find_sequence(config)
+    for key in ("depth_rate", "image_rate"):
+        if getattr(config, key) is not None and found.dataset != "event_replica":
+            raise ConfigError(
+                f"{key}: expected with event_replica alone, got it with {found.dataset}, whose files state "
+                "the times of images; leave it out"
+            )
     format = FORMATS[found.dataset]
     folder = found.folder
     if folder is None:

@@ -64,8 +64,6 @@ class EventFile:
         self.notes = summary.notes
         self._num_events = summary.num_events
         self._first, self._last = self._events.time_range  # s, as stored
-        for note in summary.notes:
-            logger.warning("%s: %s", path, note)
 
     def __len__(self) -> int:
         return self._num_events

@@ -73,6 +73,8 @@ class EventReplicaSequence(EventDepthSequence):
         )
         self._events = EventFile(events_folder / EVENTS, self.camera.width, self.camera.height)
         self.num_dropped_events = self._events.num_dropped
+        for note in self._events.notes:
+            self.note(f"{self._events.path}: {note}")
 
         self.time_offset = clock_offset(self._events.time_range[0])
         if self.time_offset:

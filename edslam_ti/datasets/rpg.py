@@ -73,6 +73,8 @@ class RpgSequence(EventDepthSequence):
 
         self._events = EventFile(folder / "events.txt", width, height, is_text=True)
         self.num_dropped_events = self._events.num_dropped
+        for note in self._events.notes:
+            self.note(f"{self._events.path}: {note}")
         self.time_offset = clock_offset(self._events.time_range[0])
         if self.time_offset:
             self._events = self._events.shifted(self.time_offset)

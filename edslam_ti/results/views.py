@@ -81,8 +81,9 @@ def save_views(
             in_slice = _image_metrics(run, inside, weights)
         numbers[kind] = ViewNumbers(len(views), measured, _depth_l1_cm(views), in_slice)
         chosen = evenly_spaced(len(views), CONTACT_ROWS[kind])
+        of_views = iter([] if measured is None else measured.views)
         for k, view in enumerate(views):
-            values = _values(view, None if measured is None else measured.views[k])
+            values = _values(view, None if view.image is None else next(of_views))
             table.append({"views": kind, "timestamp_s": f"{view.timestamp:.3f}", **values})
             row = _picture_row(kind, view, values, numbers[kind].fit)
             if kind in PICTURES:
@@ -154,8 +155,10 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 
 
 def _image_metrics(run: Run, views: list[RenderedView], lpips_weights: Path | None) -> ImageMetrics | None:
+    """Return the metrics of the views that have an image; None if none has."""
+    views = [v for v in views if v.image is not None]
     truths = [v.image for v in views if v.image is not None]
-    if not views or len(truths) < len(views):
+    if not views:
         return None
     masks = [None if v.depth is None else v.depth > 0 for v in views]
     images = [v.view.intensity for v in views]

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from written_sequences import CAMERA, some_events, write_sequence
 
-from edslam_ti.datasets import SampledSequence
+from edslam_ti.config import Config
+from edslam_ti.datasets import SampledSequence, open_sequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
-from edslam_ti.errors import DataError
+from edslam_ti.errors import ConfigError, DataError
 
 EPOCH = 1642650000
 
@@ -54,6 +55,16 @@ def test_a_rate_gives_indices_their_times(tmp_path: Path) -> None:
         assert sequence.depth_timestamps == pytest.approx(original.depth_timestamps, abs=1e-12)
         assert sequence.image_timestamps == pytest.approx(original.image_timestamps, abs=1e-12)
         assert (sequence.depth(3) == original.depth(3)).all()
+
+
+def test_settings_can_state_the_rate(tmp_path: Path) -> None:
+    folder = by_index(tmp_path / "a")
+    config = Config(scene="a", data_dir=tmp_path, depth_rate=20.0, image_rate=10.0)
+    sequence = open_sequence(config)
+    assert sequence.depth_timestamps == pytest.approx(np.arange(7) / 20)
+    assert sequence.image_timestamps == pytest.approx(np.arange(7) / 10)
+    with pytest.raises(ConfigError, match="image_rate: expected with event_replica alone, got it with rpg"):
+        open_sequence(Config(scene=folder.name, data_dir=tmp_path, dataset="rpg", image_rate=10.0))
 
 
 def test_files_of_times_give_indices_theirs(tmp_path: Path) -> None:
