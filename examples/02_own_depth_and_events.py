@@ -37,20 +37,20 @@ def make_events() -> np.ndarray:  # [N, 4] x, y, t in seconds, polarity -1 or 1;
 
 def write_sequence(folder: Path, events: np.ndarray, depths: dict[int, np.ndarray]) -> None:
     """Write events [N, 4], and depth images [H, W] in metres by their time in milliseconds."""
-    (folder / "depth").mkdir(parents=True, exist_ok=True)
-    (folder / f"event_threshold_{THRESHOLD}").mkdir(exist_ok=True)
+    for name in ("depth", f"event_threshold_{THRESHOLD}"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
     np.save(folder / f"event_threshold_{THRESHOLD}" / "gray_events_data.npy", events)
     for milliseconds, depth in depths.items():
         image = np.round(1000 * depth).astype(np.uint16)  # millimetres, 0 = missing
         cv2.imwrite(str(folder / "depth" / f"frame{milliseconds:06d}.png"), image)
-    camera = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL_LENGTH, "fy": FOCAL_LENGTH}  # pixels
-    (folder / "camera.json").write_text(json.dumps(camera | {"cx": WIDTH / 2, "cy": HEIGHT / 2}))
+    camera = dict(width=WIDTH, height=HEIGHT, fx=FOCAL_LENGTH, fy=FOCAL_LENGTH, cx=WIDTH / 2, cy=HEIGHT / 2)
+    (folder / "camera.json").write_text(json.dumps(camera))
 
 
 def main(folder: Path = Path("data/painted_wall"), out: Path = Path("results")) -> Path:
     """Write the recording, run it, and return the results folder."""
-    depth = np.full((HEIGHT, WIDTH), DISTANCE)
-    write_sequence(folder, make_events(), {ms: depth for ms in range(0, int(1000 * SECONDS), 50)})
+    depths = np.random.default_rng(0).normal(DISTANCE, 0.002, (8, HEIGHT, WIDTH))  # with noise of 2 mm
+    write_sequence(folder, make_events(), {50 * k: depth for k, depth in enumerate(depths)})
     place = {"dataset": "event_replica", "data_dir": folder.parent, "scene": folder.name, "out": out}
     return edslam_ti.run(edslam_ti.Config(**place, mapping={"iterations": 2, "final_iterations": 20}))
 

@@ -21,7 +21,7 @@ DATA = Path(os.environ.get("EDSLAM_DATA") or Path(__file__).parents[2] / "shared
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", choices=("cpu", "cuda"), default="cpu", help="where tests/kernels run")
-    parser.addoption("--kills", type=int, default=3, help="how often tests/test_checkpoint.py kills runs")
+    parser.addoption("--kills", type=int, default=1, help="how often tests/test_checkpoint.py kills runs")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -100,6 +100,7 @@ def reference(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         return run(config_for(tiny_folder, tmp_path_factory.mktemp("reference"), checkpoint=0.0), quiet())
 
 
+@pytest.mark.slow
 def test_checkpoints_change_no_result_and_leave_nothing(
     reference: Path, tiny_folder: Path, tmp_path: Path
 ) -> None:
@@ -108,6 +109,7 @@ def test_checkpoints_change_no_result_and_leave_nothing(
     assert {p.name for p in folder.iterdir()} == {p.name for p in reference.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frame", "step"), [(1, None), (7, None), (99, 5), (99, 19)])
 def test_resumed_run_is_the_uninterrupted_one(
     frame: int,
@@ -131,6 +133,7 @@ def test_resumed_run_is_the_uninterrupted_one(
     assert json.loads((folder / "metrics.json").read_text())["num_frames"] == 14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "differences"),
     [
@@ -154,6 +157,7 @@ def test_other_methods_and_settings_are_resumed_as_well(
     assert same_files(folder, whole)
 
 
+@pytest.mark.slow
 def test_interrupted_run_is_resumed_where_it_was_interrupted(
     reference: Path, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +184,7 @@ def test_interrupted_run_is_resumed_where_it_was_interrupted(
     assert not json.loads((folder / "metrics.json").read_text())["is_interrupted"]
 
 
+@pytest.mark.slow
 def test_method_that_cannot_be_kept_begins_with_the_first_frame(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,6 +205,7 @@ def test_finished_run_is_not_resumed(reference: Path, tiny_folder: Path, tmp_pat
         resume(reference, config_for(tiny_folder, tmp_path), quiet())
 
 
+@pytest.mark.slow
 def test_two_processes_cannot_be_at_one_run(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,6 +227,7 @@ def test_two_processes_cannot_be_at_one_run(
         other.communicate()
 
 
+@pytest.mark.slow
 def test_other_recording_is_refused(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_for(recording, tmp_path / "out")
     folder = cut_off(config, monkeypatch, 2)
@@ -230,6 +237,7 @@ def test_other_recording_is_refused(recording: Path, tmp_path: Path, monkeypatch
         resume(folder, config, quiet())
 
 
+@pytest.mark.slow
 def test_other_settings_are_refused(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,6 +311,7 @@ def test_damaged_checkpoint_is_passed_over(damage: str, tmp_path: Path) -> None:
     assert not (tmp_path / ".3.partial").exists()
 
 
+@pytest.mark.slow
 def test_full_disk_ends_no_run(
     reference: Path, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -62,6 +62,7 @@ def test_whole_files_are_read_as_open3d_reads_them(mesh: Path, cloud: Path) -> N
     np.testing.assert_array_equal(np.asarray(read.colors), np.asarray(same.colors))
 
 
+@pytest.mark.slow
 def test_rarer_kinds_are_read_in_a_child_to_the_same_values(mesh: Path, cloud: Path, tmp_path: Path) -> None:
     o3d = load_open3d()
     text = tmp_path / "text.ply"
@@ -114,6 +115,7 @@ def test_damage_is_named(mesh: Path, name: str) -> None:
     assert len(str(caught.value)) < 600
 
 
+@pytest.mark.slow
 def test_a_text_file_that_is_cut_off_is_refused(mesh: Path) -> None:
     o3d = load_open3d()
     text = mesh.with_name("text.ply")
@@ -124,6 +126,7 @@ def test_a_text_file_that_is_cut_off_is_refused(mesh: Path) -> None:
         read_triangle_mesh(text)
 
 
+@pytest.mark.slow
 def test_random_bytes_are_refused_or_read_but_never_crash(mesh: Path) -> None:
     """Sound by the check means sound for Open3D: a process of its own reads all that the check lets pass."""
     original = mesh.read_bytes()
@@ -166,6 +169,7 @@ def test_a_reader_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.Monkey
         read_model(path)
 
 
+@pytest.mark.slow
 def test_files_without_content_are_refused(mesh: Path, cloud: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="could not read any triangle"):
         read_triangle_mesh(cloud)
@@ -177,6 +181,7 @@ def test_files_without_content_are_refused(mesh: Path, cloud: Path, tmp_path: Pa
             read(tmp_path / "absent.ply")
 
 
+@pytest.mark.slow
 def test_open3d_loads_without_running_a_compiler(tmp_path: Path) -> None:
     """A search for libusb by ctypes would run gcc and ld of the user's PATH."""
     for name in ("gcc", "cc", "ld", "ldconfig", "objdump"):

@@ -259,6 +259,7 @@ def test_both_protocols_are_named(result: Path) -> None:
     assert "no slice of theirs" in theirs["trajectory"]
 
 
+@pytest.mark.slow
 def test_slice_of_inceventgs_is_measured_apart(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -344,6 +345,7 @@ def test_true_poses_have_no_error(tiny_folder: Path, tmp_path: Path) -> None:
     assert "poses truth" in metrics["protocol"]
 
 
+@pytest.mark.slow
 def test_lpips_weights_give_a_perceptual_distance(
     tiny_folder: Path, tmp_path: Path, shared_data: Path
 ) -> None:
@@ -389,6 +391,7 @@ def test_depth_that_is_all_zero_is_refused_before_the_first_frame(recording: Pat
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_depth_of_two_pixels_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
     depth = np.zeros((80, 120), np.uint16)
     depth[0, :2] = 5000, 9000
@@ -534,6 +537,7 @@ def state_of(folder: Path) -> str:
     return json.loads((folder / "run.json").read_text())["state"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error", [np.linalg.LinAlgError("Singular matrix"), DataError("broken"), OSError(28, "No space left")]
 )
@@ -556,6 +560,7 @@ def test_exception_in_the_loop_saves_path_and_map_so_far(
         assert "Traceback" in (folder / "log.txt").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_signals_save_what_there_is(
     name: str,
@@ -574,6 +579,7 @@ def test_signals_save_what_there_is(
     assert len(read_tum(result[2] / "trajectory_tum.txt")) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["loop", "saving"])
 def test_second_interrupt_keeps_path_and_map_and_leaves_the_rest(
     when: str,
@@ -610,6 +616,7 @@ def raise_at(frame: int, number: int, monkeypatch: pytest.MonkeyPatch, times: in
     monkeypatch.setattr(Slam, "process", processed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["plot_trajectory", "save_views", "run_metrics"])
 def test_part_that_fails_is_left_out(
     part: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -666,6 +673,7 @@ def test_more_than_a_tenth_of_lost_frames_is_exit_code_3(
     assert state_of(folder) == "finished"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["depth/frame000400.png", "images/frame000400.png"])
 def test_unreadable_image_in_the_middle_is_a_frame_without_it(
     name: str, recording: Path, tmp_path: Path
@@ -716,6 +724,7 @@ def test_place_that_cannot_be_written_shows_before_the_first_frame(
     assert (tmp_path / "file").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_unreadable_novel_views_are_left_out_of_evaluation(recording: Path, tmp_path: Path) -> None:
     path = sorted((recording / "novel_views" / "images").iterdir())[1]
     path.write_bytes(path.read_bytes()[:300])

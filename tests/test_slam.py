@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from sequences import make_slam, settings
 
 from edslam_ti.camera import Camera
@@ -109,6 +110,7 @@ def test_depth_that_the_tracker_distrusts_is_kept_from_the_map() -> None:
     assert forgotten == [[0, 1]]
 
 
+@pytest.mark.slow
 def test_mapping_while_tracking_keeps_the_tracked_poses(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:

@@ -128,6 +128,7 @@ event_file.EventFile(Path(sys.argv[1]), 32, 24, progress=progress)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("copied")
 def test_an_interrupted_copy_is_never_used_and_is_removed(tmp_path: Path, cache: Path) -> None:
     path = saved(tmp_path, some_events())
@@ -189,6 +190,7 @@ def test_a_long_first_reading_is_followed(tmp_path: Path) -> None:
     assert shares[-1] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("copied")
 def test_a_burst_needs_no_additional_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()

@@ -69,6 +69,7 @@ def test_exp_and_masks_match_numpy_in_single_precision() -> None:
     check(torch.float32, 1.5e-6)  # eight times the rounding of exp(x / 8)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("double_precision")
 def test_exp_and_masks_match_numpy_in_double_precision() -> None:
     check(torch.float64, 1e-13)
@@ -85,6 +86,7 @@ def test_log_matches_numpy_in_single_precision() -> None:
     check_log(torch.float32, 3e-6)  # sixteen times the rounding of log(x^(1/16))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("double_precision")
 def test_log_matches_numpy_in_double_precision() -> None:
     check_log(torch.float64, 1e-13)

@@ -152,6 +152,7 @@ def test_map_never_exceeds_its_largest_size(
     assert 1000 < mapper.num_gaussians <= 1500
 
 
+@pytest.mark.slow
 def test_small_map_covers_more_of_the_last_view(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:

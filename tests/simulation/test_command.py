@@ -30,6 +30,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 def test_an_older_recording_is_replaced(tmp_path: Path) -> None:
     out = tmp_path / "wall"
     simulate_wall(out)
@@ -88,7 +89,8 @@ def app(out: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen([*command, *size, *options], stderr=subprocess.PIPE, text=True, cwd=ROOT)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_an_interrupted_simulation_leaves_the_old_recording(tmp_path: Path, number: signal.Signals) -> None:
     out = tmp_path / "wall"
     simulate_wall(out)
@@ -160,6 +162,7 @@ def test_settings_have_bounds(name: str, value: object) -> None:
     assert len(str(caught.value)) < 300
 
 
+@pytest.mark.slow
 def test_a_recording_without_events_says_why(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no event fired; brightness changes by less than the contrast"):
         simulate_wall(tmp_path / "out", SMALL.model_copy(update={"contrast_threshold": 9.0}))
@@ -170,6 +173,7 @@ def test_a_recording_without_events_says_why(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["away.txt"]
 
 
+@pytest.mark.slow
 def test_names_of_scenes_are_printed_without_control_characters(tmp_path: Path) -> None:
     process = app(tmp_path / "out", "--scene", "wa\x1b]0;title\x07ll[red]")
     _, text = process.communicate(timeout=60)
@@ -178,6 +182,7 @@ def test_names_of_scenes_are_printed_without_control_characters(tmp_path: Path) 
     assert text.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_far_trajectory_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "far.txt"
     path.write_text("0 0 0 0 0 0 0 1\n1 1e3 0 0 0 0 0 1\n")

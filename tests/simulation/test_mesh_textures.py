@@ -104,6 +104,7 @@ def test_deep_json_is_refused(tmp_path: Path) -> None:
         load_mesh(tmp_path / "m.gltf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-5, 1e6])
 def test_scenes_of_absurd_size_are_refused(tmp_path: Path, scale: float) -> None:
     with pytest.raises(DataError, match=r"expected a scene of 0\.001 to 1e\+06 m, not .* check its scale"):

@@ -415,6 +415,7 @@ def test_unusable_settings_are_named(office: Room, tmp_path: Path) -> None:
         simulate(office.scene, HandHeldPath(office, 0.04), SimulationConfig(duration=0.04), tmp_path / "x")
 
 
+@pytest.mark.slow
 def test_obj_texture_is_the_right_way_up(tmp_path: Path) -> None:
     scene = load_mesh(write_textured_square(tmp_path), scale=2.0)
     camera = Camera(20, 20, 8.0, 8.0, 9.5, 9.5)
@@ -450,6 +451,7 @@ def view_of_glb(path: Path) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_glb_texture_is_the_right_way_up_and_tinted(tmp_path: Path) -> None:
     write_textured_square(tmp_path)
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # glTF: v points down
@@ -465,6 +467,7 @@ def test_glb_texture_is_the_right_way_up_and_tinted(tmp_path: Path) -> None:
         assert abs(grey[rows, columns].mean() - 0.5 * 60 / 255) < 0.02
 
 
+@pytest.mark.slow
 def test_vertex_coloured_meshes_keep_their_brightness(tmp_path: Path) -> None:
     colour = np.full((4, 3), 0.6, np.float32)
     colour[1:3] = 0.9  # brighter to the right

@@ -41,6 +41,7 @@ def judged(sequence: EventDepthSequence, given: list[Sample] | None = None) -> C
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "rate"), [("none", None), ("kinect", None), ("kinect", 10.0)])
 def test_a_right_recording_has_no_problem(
     sequence: EventDepthSequence, noise: str, rate: float | None
@@ -50,6 +51,7 @@ def test_a_right_recording_has_no_problem(
     assert abs(found.depth_delay_s) < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.025, -0.025])
 def test_a_delay_of_depth_is_measured(sequence: EventDepthSequence, delay: float) -> None:
     given = samples(sequence)
@@ -67,6 +69,7 @@ def test_a_wrong_focal_length_contradicts(sequence: EventDepthSequence) -> None:
     assert any("contradict each other" in p for p in found.problems)
 
 
+@pytest.mark.slow
 def test_depth_that_has_stopped_is_named(sequence: EventDepthSequence) -> None:
     given = samples(sequence)
     frozen = [s if k < 8 else replace(s, depth=given[8].depth) for k, s in enumerate(given)]

@@ -53,6 +53,7 @@ def distrusted(slam: Slam) -> list[int]:
     return sorted(k for result in slam.results for k in result.distrusted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("a", "b"), [(1, 5), (2, 11), (8, 11), (0, 4), (0, 3)])
 def test_swapped_depth_images_are_left_out(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], a: int, b: int
@@ -94,6 +95,7 @@ def test_depth_that_is_wrong_all_along_is_not_left_out(
     assert len(distrusted(tracked(tiny_sequence, late))) <= 1
 
 
+@pytest.mark.slow
 def test_the_map_forgets_what_wrong_depth_has_added(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:

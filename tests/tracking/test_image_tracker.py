@@ -88,6 +88,7 @@ def errors_cm(slam: Slam, samples: list[Sample]) -> np.ndarray:  # [F]
     return 100 * np.linalg.norm(slam.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
 
 
+@pytest.mark.slow
 def test_after_a_blackout_an_old_keyframe_relocalises_the_camera(
     sequence: EventDepthSequence, samples: list[Sample]
 ) -> None:
@@ -109,6 +110,7 @@ def test_after_a_blackout_an_old_keyframe_relocalises_the_camera(
     assert errors_cm(found, path)[list(blackout)].max() < 0.2 * errors_cm(not_found, path)[33]
 
 
+@pytest.mark.slow
 def test_revisit_removes_drift(sequence: EventDepthSequence, samples: list[Sample]) -> None:
     # Depth that becomes 2 % too long on the way there, and soon right again on the way back: a path of
     # another length, which does not end where it began.
@@ -163,6 +165,7 @@ def with_noisy_pixels(sample: Sample, pixels: np.ndarray, rate: float) -> Sample
     return replace(sample, events=events[np.argsort(events.t, kind="stable")])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_brightness", [True, False])
 def test_noisy_pixels_are_masked(
     sequence: EventDepthSequence, samples: list[Sample], is_brightness: bool

@@ -66,6 +66,7 @@ def errors_and_sigmas(slam: Slam, sequence: EventDepthSequence) -> tuple[np.ndar
     return errors, sigmas(absolute_covariances(slam.results, slam.trajectory))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["none", "kinect"])
 @pytest.mark.parametrize("method", ["ed_slam", "ed_slam_paper"])
 def test_sigmas_are_of_the_size_of_the_errors(
