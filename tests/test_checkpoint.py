@@ -29,6 +29,9 @@ from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import read_tum
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
+
 COMPARED = ("trajectory_tum.txt", "trajectory_frontend_tum.txt", "map.ply")
 FEW = {"iterations": 1, "final_iterations": 20}
 
@@ -100,7 +103,6 @@ def reference(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         return run(config_for(tiny_folder, tmp_path_factory.mktemp("reference"), checkpoint=0.0), quiet())
 
 
-@pytest.mark.slow
 def test_checkpoints_change_no_result_and_leave_nothing(
     reference: Path, tiny_folder: Path, tmp_path: Path
 ) -> None:
@@ -109,7 +111,6 @@ def test_checkpoints_change_no_result_and_leave_nothing(
     assert {p.name for p in folder.iterdir()} == {p.name for p in reference.iterdir()}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("frame", "step"), [(1, None), (7, None), (99, 5), (99, 19)])
 def test_resumed_run_is_the_uninterrupted_one(
     frame: int,
@@ -133,7 +134,6 @@ def test_resumed_run_is_the_uninterrupted_one(
     assert json.loads((folder / "metrics.json").read_text())["num_frames"] == 14
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "differences"),
     [
@@ -157,7 +157,6 @@ def test_other_methods_and_settings_are_resumed_as_well(
     assert same_files(folder, whole)
 
 
-@pytest.mark.slow
 def test_interrupted_run_is_resumed_where_it_was_interrupted(
     reference: Path, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +183,6 @@ def test_interrupted_run_is_resumed_where_it_was_interrupted(
     assert not json.loads((folder / "metrics.json").read_text())["is_interrupted"]
 
 
-@pytest.mark.slow
 def test_method_that_cannot_be_kept_begins_with_the_first_frame(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,7 +203,6 @@ def test_finished_run_is_not_resumed(reference: Path, tiny_folder: Path, tmp_pat
         resume(reference, config_for(tiny_folder, tmp_path), quiet())
 
 
-@pytest.mark.slow
 def test_two_processes_cannot_be_at_one_run(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -227,7 +224,6 @@ def test_two_processes_cannot_be_at_one_run(
         other.communicate()
 
 
-@pytest.mark.slow
 def test_other_recording_is_refused(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_for(recording, tmp_path / "out")
     folder = cut_off(config, monkeypatch, 2)
@@ -237,7 +233,6 @@ def test_other_recording_is_refused(recording: Path, tmp_path: Path, monkeypatch
         resume(folder, config, quiet())
 
 
-@pytest.mark.slow
 def test_other_settings_are_refused(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,7 +306,6 @@ def test_damaged_checkpoint_is_passed_over(damage: str, tmp_path: Path) -> None:
     assert not (tmp_path / ".3.partial").exists()
 
 
-@pytest.mark.slow
 def test_full_disk_ends_no_run(
     reference: Path, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -327,7 +321,6 @@ def test_full_disk_ends_no_run(
 # --- kill -9 ---
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_killed_runs_come_to_the_same_end(tiny_folder: Path, tmp_path: Path, kills: int) -> None:
     finished(new_run(tiny_folder, tmp_path / "reference"))

@@ -36,6 +36,9 @@ from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import read_tum
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
+
 ROOT = Path(__file__).parents[1]
 FEW = {"iterations": 1, "final_iterations": 10}
 ARTEFACTS = {
@@ -124,7 +127,6 @@ def recording(tiny_folder: Path, tmp_path: Path) -> Path:
 # --- what a run leaves behind ---
 
 
-@pytest.mark.slow
 def test_every_artefact_is_there_and_holds_something(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == ARTEFACTS
     assert all(path.stat().st_size > 0 for path in result.iterdir())
@@ -259,7 +261,6 @@ def test_both_protocols_are_named(result: Path) -> None:
     assert "no slice of theirs" in theirs["trajectory"]
 
 
-@pytest.mark.slow
 def test_slice_of_inceventgs_is_measured_apart(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,7 +272,6 @@ def test_slice_of_inceventgs_is_measured_apart(
     assert 10 < theirs["psnr_corrected_db"] != metrics["psnr_corrected_db_all"]
 
 
-@pytest.mark.slow
 def test_saved_settings_make_the_same_run(result: Path, tmp_path: Path) -> None:
     values = yaml.safe_load((result / "config.yaml").read_text())
     again = quiet_run(Config().updated(values | {"out": str(tmp_path)}))
@@ -306,7 +306,6 @@ def test_tracking_alone_writes_no_map(tiny_folder: Path, tmp_path: Path) -> None
     assert metrics["num_gaussians"] == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("is_mapping", "expected"), [(True, 6), (False, 0)])
 def test_free_memory_is_given_back_after_every_mapped_frame(
     is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -318,7 +317,6 @@ def test_free_memory_is_given_back_after_every_mapped_frame(
     assert len(calls) == expected
 
 
-@pytest.mark.slow
 def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "open3d_rgbd"))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"map.ply"}  # it has no Gaussians
@@ -330,14 +328,12 @@ def test_open3d_baseline_goes_through_the_same_pipeline(tiny_folder: Path, tmp_p
     assert metrics["psnr_db"] > 15  # it fuses the images themselves
 
 
-@pytest.mark.slow
 def test_paper_method_runs_by_its_name(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, "ed_slam_paper", mapping={"enabled": False}))
     assert folder.parent.name == "ed_slam_paper"
     assert yaml.safe_load((folder / "config.yaml").read_text())["tracking"]["depth_weight"] == 0
 
 
-@pytest.mark.slow
 def test_true_poses_have_no_error(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, poses="truth"))
     metrics = metrics_of(folder)
@@ -345,7 +341,6 @@ def test_true_poses_have_no_error(tiny_folder: Path, tmp_path: Path) -> None:
     assert "poses truth" in metrics["protocol"]
 
 
-@pytest.mark.slow
 def test_lpips_weights_give_a_perceptual_distance(
     tiny_folder: Path, tmp_path: Path, shared_data: Path
 ) -> None:
@@ -360,7 +355,6 @@ def test_lpips_weights_give_a_perceptual_distance(
 # --- data that lacks something ---
 
 
-@pytest.mark.slow
 def test_recording_of_events_and_depth_alone_runs_without_metrics(recording: Path, tmp_path: Path) -> None:
     shutil.rmtree(recording / "images")
     for name in ("poses_ts.txt", "traj.txt"):
@@ -391,7 +385,6 @@ def test_depth_that_is_all_zero_is_refused_before_the_first_frame(recording: Pat
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_depth_of_two_pixels_still_gives_a_trajectory(recording: Path, tmp_path: Path) -> None:
     depth = np.zeros((80, 120), np.uint16)
     depth[0, :2] = 5000, 9000
@@ -410,14 +403,12 @@ def test_a_map_that_is_empty_is_said_to_be(tiny_folder: Path, tmp_path: Path) ->
     assert metrics_of(folder)["depth_l1_cm"] is None
 
 
-@pytest.mark.slow
 def test_map_without_a_surface_keeps_its_other_results(tiny_folder: Path, tmp_path: Path) -> None:
     folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.3, mapping={"max_gaussians": 2}))
     assert {p.name for p in folder.iterdir()} == ARTEFACTS - {"mesh.ply"}
     assert "mesh.ply: no surface" in (folder / "log.txt").read_text()
 
 
-@pytest.mark.slow
 def test_inverted_polarity_is_told_with_the_results(recording: Path, tmp_path: Path) -> None:
     (events_file,) = recording.glob("event_threshold_*/*.npy")
     events = np.load(events_file)
@@ -428,7 +419,6 @@ def test_inverted_polarity_is_told_with_the_results(recording: Path, tmp_path: P
     assert note.startswith("polarity looks inverted")
 
 
-@pytest.mark.slow
 def test_a_view_without_an_image_is_left_out_alone(recording: Path, tmp_path: Path) -> None:
     views = quiet_run(config_for(recording, tmp_path / "whole")) / "renders/views.csv"
     whole = [row.split(",") for row in views.read_text().splitlines() if row.startswith("held out")]
@@ -456,7 +446,6 @@ def interrupt_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Slam, "process", processed)
 
 
-@pytest.mark.slow
 def test_interrupt_saves_partial_results_and_exits_130(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -478,7 +467,6 @@ def test_interrupt_saves_partial_results_and_exits_130(
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.slow
 def test_interrupt_while_refining_stops_it(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -537,7 +525,6 @@ def state_of(folder: Path) -> str:
     return json.loads((folder / "run.json").read_text())["state"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "error", [np.linalg.LinAlgError("Singular matrix"), DataError("broken"), OSError(28, "No space left")]
 )
@@ -560,7 +547,6 @@ def test_exception_in_the_loop_saves_path_and_map_so_far(
         assert "Traceback" in (folder / "log.txt").read_text()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_signals_save_what_there_is(
     name: str,
@@ -579,7 +565,6 @@ def test_signals_save_what_there_is(
     assert len(read_tum(result[2] / "trajectory_tum.txt")) == 5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("when", ["loop", "saving"])
 def test_second_interrupt_keeps_path_and_map_and_leaves_the_rest(
     when: str,
@@ -616,7 +601,6 @@ def raise_at(frame: int, number: int, monkeypatch: pytest.MonkeyPatch, times: in
     monkeypatch.setattr(Slam, "process", processed)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("part", ["plot_trajectory", "save_views", "run_metrics"])
 def test_part_that_fails_is_left_out(
     part: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -673,7 +657,6 @@ def test_more_than_a_tenth_of_lost_frames_is_exit_code_3(
     assert state_of(folder) == "finished"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["depth/frame000400.png", "images/frame000400.png"])
 def test_unreadable_image_in_the_middle_is_a_frame_without_it(
     name: str, recording: Path, tmp_path: Path
@@ -724,7 +707,6 @@ def test_place_that_cannot_be_written_shows_before_the_first_frame(
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.slow
 def test_unreadable_novel_views_are_left_out_of_evaluation(recording: Path, tmp_path: Path) -> None:
     path = sorted((recording / "novel_views" / "images").iterdir())[1]
     path.write_bytes(path.read_bytes()[:300])

@@ -16,6 +16,9 @@ import pytest
 from edslam_ti.kernels.compiled_cache import CompiledKernels, _checksums
 from edslam_ti.kernels.engine import ENGINE, ti
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
+
 ROOT = Path(__file__).parents[2]
 RUNS_A_KERNEL = """
 import numpy as np, sys
@@ -66,7 +69,6 @@ def copy(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "cache"))
 
 
-@pytest.mark.slow
 def test_the_second_run_uses_what_the_first_compiled(copy: Path) -> None:
     before = kept_files(copy)
     assert before
@@ -115,7 +117,6 @@ def damage_files(cache: Path, damage: str, which: str) -> None:
             DAMAGES[damage](path)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["flipped", "folder"])
 def test_a_damaged_cache_is_made_anew_once(copy: Path, damage: str) -> None:
     damage_files(copy, damage, "*")
@@ -146,7 +147,6 @@ def test_damaged_files_are_removed_before_the_engine_reads_them(
     assert caplog.text == ""
 
 
-@pytest.mark.slow
 def test_files_that_nobody_noted_are_removed(copy: Path) -> None:
     (folder,) = (copy / "kernels").iterdir()
     (folder / "compiled" / "Tffff.tic").write_bytes(b"half")
@@ -154,7 +154,6 @@ def test_files_that_nobody_noted_are_removed(copy: Path) -> None:
     assert "Tffff.tic" not in kept_files(copy)
 
 
-@pytest.mark.slow
 def test_a_lock_that_a_killed_engine_left_does_not_stop_the_cache(copy: Path) -> None:
     (folder,) = (copy / "kernels").iterdir()
     shutil.rmtree(folder / "compiled")
@@ -174,7 +173,6 @@ HOMES: dict[str, dict[str, str | None]] = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("home", HOMES)
 def test_runs_without_a_usable_home(tmp_path: Path, home: str) -> None:
     done = run({"EDSLAM_CACHE": None, **HOMES[home], "TMPDIR": str(tmp_path)})
@@ -185,7 +183,6 @@ def test_runs_without_a_usable_home(tmp_path: Path, home: str) -> None:
     assert list(tmp_path.iterdir()) == []  # what had to be temporary is gone
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounting needs root")
 def test_runs_where_the_cache_is_read_only(made: Path, tmp_path: Path) -> None:
     place = tmp_path / "read_only"
@@ -214,7 +211,6 @@ HOW
 )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "is_remade"),
     [
@@ -235,7 +231,6 @@ def test_a_crash_in_the_engine_discards_the_cache(copy: Path, how: str, is_remad
     assert run({"EDSLAM_CACHE": str(copy)}).stderr == ""
 
 
-@pytest.mark.slow
 def test_several_processes_share_one_empty_cache(tmp_path: Path) -> None:
     command = [sys.executable, "-c", RUNS_A_KERNEL]
     environment = changed({"EDSLAM_CACHE": str(tmp_path)})
@@ -250,7 +245,6 @@ def test_several_processes_share_one_empty_cache(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.slow
 def test_a_restart_saves_what_was_compiled(tmp_path: Path) -> None:
     code = RUNS_A_KERNEL + "kernels.init('cpu', precision='f64', threads=2)\n"
     code += "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"

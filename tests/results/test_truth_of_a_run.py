@@ -20,6 +20,8 @@ from edslam_ti.results import views
 from edslam_ti.results.reading import load_result
 from edslam_ti.trajectory import read_tum
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
 
 @pytest.fixture(autouse=True)
 def taichi_is_started_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,7 +76,6 @@ def test_summary_and_metrics_have_both_alignments_the_scale_and_the_coverage(
     assert "14 compared with truth (100 %)" in printed
 
 
-@pytest.mark.slow
 def test_errors_are_counted_where_truth_exists(tiny_folder: Path, recording: Path, tmp_path: Path) -> None:
     whole = metrics_of(saved(tiny_folder, tmp_path / "whole")[0])
     change_truth(recording, with_hole)
@@ -91,7 +92,6 @@ def test_errors_are_counted_where_truth_exists(tiny_folder: Path, recording: Pat
     assert metrics["truth_notes"][0] in (folder / "log.txt").read_text()
 
 
-@pytest.mark.slow
 def test_true_poses_are_not_invented_in_a_hole(recording: Path, tmp_path: Path) -> None:
     change_truth(recording, with_hole)
     folder, _ = saved(recording, tmp_path / "out", tracking_only=False, poses="truth")
@@ -102,7 +102,6 @@ def test_true_poses_are_not_invented_in_a_hole(recording: Path, tmp_path: Path) 
     assert metrics["mesh_accuracy_cm"] > 0
 
 
-@pytest.mark.slow
 def test_inverted_truth_is_named_and_the_run_is_saved(recording: Path, tmp_path: Path) -> None:
     shutil.rmtree(recording / "novel_views")
     change_truth(recording, lambda times, poses: (times, np.linalg.inv(poses)))
@@ -114,7 +113,6 @@ def test_inverted_truth_is_named_and_the_run_is_saved(recording: Path, tmp_path:
     assert (folder / "mesh.ply").is_file()
 
 
-@pytest.mark.slow
 def test_part_of_the_evaluation_that_fails_is_left_out(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,6 +32,9 @@ from edslam_ti.simulation.renderer import Renderer
 from edslam_ti.simulation.scene import Material, SceneBuilder
 from edslam_ti.trajectory import Trajectory, read_tum
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
+
 TINY = SimulationConfig(width=96, height=64, duration=0.3)
 
 
@@ -109,7 +112,6 @@ def test_edge_pixels_hold_the_covered_share() -> None:
     np.testing.assert_allclose(render.grey[4], [0.1] * 4 + [0.1 * 0.9 + 0.9 * 0.1] + [0.9] * 4, atol=0.051)
 
 
-@pytest.mark.slow
 def test_image_warped_by_true_depth_and_pose_matches(office: Room) -> None:
     camera = Camera(160, 100, 80.0, 80.0, 79.5, 49.5)
     renderer = Renderer(office.scene, camera)
@@ -136,7 +138,6 @@ def test_image_warped_by_true_depth_and_pose_matches(office: Room) -> None:
     assert difference(0.0) < 0.7 * min(difference(0.5), difference(-0.5))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [*ROOM_NAMES, *UNSEEN_ROOM_NAMES])
 def test_room_is_closed_and_textured(name: str) -> None:
     room = cached_room(name)
@@ -152,7 +153,6 @@ def test_room_is_closed_and_textured(name: str) -> None:
         assert (np.ptp(blocks, axis=(2, 3)) > 0.1).mean() > 0.85
 
 
-@pytest.mark.slow
 def test_wall_is_flat_textured_and_fills_the_view() -> None:
     room = cached_room("wall")
     config = SimulationConfig(width=120, height=76)
@@ -171,7 +171,6 @@ def test_wall_is_flat_textured_and_fills_the_view() -> None:
             assert (np.ptp(blocks, axis=(2, 3)) > 0.1).mean() > 0.95
 
 
-@pytest.mark.slow
 def test_corridor_is_long_and_has_less_texture_than_a_room() -> None:
     config = SimulationConfig(width=120, height=76)
 
@@ -185,14 +184,12 @@ def test_corridor_is_long_and_has_less_texture_than_a_room() -> None:
     assert contrast("corridor") < 0.75 * contrast("office0")
 
 
-@pytest.mark.slow
 def test_room_is_the_same_every_time(office: Room) -> None:
     first, again = office.scene, make_room("office0").scene
     np.testing.assert_array_equal(first.vertices, again.vertices)
     np.testing.assert_array_equal(first.texture_table().texels, again.texture_table().texels)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENE_NAMES)
 def test_path_is_hand_held_and_clear_of_furniture(name: str) -> None:
     o3d = load_open3d()
@@ -215,7 +212,6 @@ def test_path_is_hand_held_and_clear_of_furniture(name: str) -> None:
         assert 3 * slowest < turn.max() < 200
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in SCENE_NAMES if n != "wall"])
 def test_loop_turns_around_returns_and_stays_clear_of_furniture(name: str) -> None:
     o3d = load_open3d()
@@ -250,7 +246,6 @@ def test_stop_and_go_rests_without_a_tremor(office: Room) -> None:
     assert np.linalg.norm(path.pose(1.6)[:3, 3] - path.pose(2.6)[:3, 3]) > 0.05  # GO
 
 
-@pytest.mark.slow
 def test_recording_can_lose_a_stretch_of_each_stream(office: Room, tmp_path: Path) -> None:
     settings = TINY.model_copy(update={"event_gap": (0.1, 0.08), "depth_gap": (0.08, 0.05)})
     simulate(office.scene, HandHeldPath(office, TINY.duration), settings, tmp_path / "gaps")
@@ -261,7 +256,6 @@ def test_recording_can_lose_a_stretch_of_each_stream(office: Room, tmp_path: Pat
     assert depths == [f"frame000{t:03d}.png" for t in (0, 50, 150, 200, 250, 300)]
 
 
-@pytest.mark.slow
 def test_compact_events_and_dense_poses(office: Room, recording: Path, tmp_path: Path) -> None:
     settings = TINY.model_copy(update={"compact_events": True, "pose_rate": 100.0})
     simulate(office.scene, HandHeldPath(office, TINY.duration), settings, tmp_path / "compact")
@@ -384,7 +378,6 @@ def test_recorded_path_starts_at_zero_where_it_is_put() -> None:
         RecordedPath(recorded, start=5.0)
 
 
-@pytest.mark.slow
 def test_builtin_sequence_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path))
     monkeypatch.setattr("edslam_ti.datasets.builtin.make_room", cached_room)
@@ -415,7 +408,6 @@ def test_unusable_settings_are_named(office: Room, tmp_path: Path) -> None:
         simulate(office.scene, HandHeldPath(office, 0.04), SimulationConfig(duration=0.04), tmp_path / "x")
 
 
-@pytest.mark.slow
 def test_obj_texture_is_the_right_way_up(tmp_path: Path) -> None:
     scene = load_mesh(write_textured_square(tmp_path), scale=2.0)
     camera = Camera(20, 20, 8.0, 8.0, 9.5, 9.5)
@@ -451,7 +443,6 @@ def view_of_glb(path: Path) -> np.ndarray:
     )
 
 
-@pytest.mark.slow
 def test_glb_texture_is_the_right_way_up_and_tinted(tmp_path: Path) -> None:
     write_textured_square(tmp_path)
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # glTF: v points down
@@ -467,7 +458,6 @@ def test_glb_texture_is_the_right_way_up_and_tinted(tmp_path: Path) -> None:
         assert abs(grey[rows, columns].mean() - 0.5 * 60 / 255) < 0.02
 
 
-@pytest.mark.slow
 def test_vertex_coloured_meshes_keep_their_brightness(tmp_path: Path) -> None:
     colour = np.full((4, 3), 0.6, np.float32)
     colour[1:3] = 0.9  # brighter to the right
@@ -497,7 +487,6 @@ def test_mesh_without_colour_or_triangles_is_refused(tmp_path: Path) -> None:
         load_mesh(tmp_path / "absent.obj")
 
 
-@pytest.mark.slow
 def test_real_mesh_and_real_motion(shared_data: Path, tmp_path: Path) -> None:
     scene = load_mesh(shared_data / "scenes" / "viking_room" / "viking_room.obj", scale=4.0)
     recorded = read_tum(shared_data / "trajectories" / "hdr_normal.txt")

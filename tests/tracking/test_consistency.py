@@ -12,6 +12,8 @@ from edslam_ti.datasets.base import WrappedSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.tracking.consistency import Consistency
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> EventDepthSequence:
@@ -41,7 +43,6 @@ def judged(sequence: EventDepthSequence, given: list[Sample] | None = None) -> C
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "rate"), [("none", None), ("kinect", None), ("kinect", 10.0)])
 def test_a_right_recording_has_no_problem(
     sequence: EventDepthSequence, noise: str, rate: float | None
@@ -51,7 +52,6 @@ def test_a_right_recording_has_no_problem(
     assert abs(found.depth_delay_s) < 0.004
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.025, -0.025])
 def test_a_delay_of_depth_is_measured(sequence: EventDepthSequence, delay: float) -> None:
     given = samples(sequence)
@@ -69,7 +69,6 @@ def test_a_wrong_focal_length_contradicts(sequence: EventDepthSequence) -> None:
     assert any("contradict each other" in p for p in found.problems)
 
 
-@pytest.mark.slow
 def test_depth_that_has_stopped_is_named(sequence: EventDepthSequence) -> None:
     given = samples(sequence)
     frozen = [s if k < 8 else replace(s, depth=given[8].depth) for k, s in enumerate(given)]

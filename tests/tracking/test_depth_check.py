@@ -12,6 +12,8 @@ from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.depth_check import MOST_IN_A_ROW, DepthCheck, is_contradiction, left_out, sets_to_try
 
+pytestmark = pytest.mark.slow  # whole runs, or processes of their own
+
 
 def test_a_contradiction_is_far_beyond_what_is_usual_and_fits_worse() -> None:
     assert is_contradiction(flow=2.0, usual=0.05, misfit=0.09, misfit_without=0.05)
@@ -53,7 +55,6 @@ def distrusted(slam: Slam) -> list[int]:
     return sorted(k for result in slam.results for k in result.distrusted)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("a", "b"), [(1, 5), (2, 11), (8, 11), (0, 4), (0, 3)])
 def test_swapped_depth_images_are_left_out(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], a: int, b: int
@@ -95,7 +96,6 @@ def test_depth_that_is_wrong_all_along_is_not_left_out(
     assert len(distrusted(tracked(tiny_sequence, late))) <= 1
 
 
-@pytest.mark.slow
 def test_the_map_forgets_what_wrong_depth_has_added(
     tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
 ) -> None:
