@@ -14,6 +14,7 @@ from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import FARTHEST, true_path, true_poses_at
 
 FEWEST_POSES = 3  # needed for an alignment
+NO_TRANSLATION = 1e-6  # m from the mean; true positions this close together determine no scale
 UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}  # of time stamps, per second
 ACROSS_A_HOLE = 1.5  # a step longer than this many usual steps between compared poses crosses a hole
 
@@ -150,11 +151,13 @@ def align(
 
     Umeyama 1991, computed by evo. Positions on a line (a slider) or at one point do not determine R, and evo
     refuses them. Then, among the rotations that fit the positions equally well, the one that best fits the
-    orientations is returned.
+    orientations is returned. Without translation in the truth (a turn on the spot), s is 1.
     """
     from evo.core.geometry import GeometryException, umeyama_alignment
 
     p, q = estimated[:, :3, 3], true[:, :3, 3]
+    if np.linalg.norm(q - q.mean(0), axis=1).max() < NO_TRANSLATION:
+        with_scale = False
     try:
         R, t, scale = umeyama_alignment(p.T, q.T, with_scale)
         if np.isfinite(scale):

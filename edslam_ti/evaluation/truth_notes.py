@@ -15,6 +15,7 @@ MOST_POSES = 400  # evenly spaced poses that are checked; a fault concerns all o
 FULL_COVERAGE = 0.95  # share of frames: the last ones may come after the truth's end
 
 SCALE_DIFFERS = 0.005  # smallest difference of scale, besides three times its uncertainty
+SMALL_RESIDUAL = 0.2  # of the true path's extent; above, a scale only hides an estimate that is wrong
 CLEARLY_BETTER = 0.5  # a cause explains an error if at most this share of it remains
 HIGH_RPE = 5.0  # times the ATE; errors of positions alone give at most 2
 SMALL_ATE, SMALL_RPE = 1e-3, 0.05  # cm: below these their ratio means nothing
@@ -103,7 +104,7 @@ def _scaling(errors: TrajectoryErrors) -> list[str]:
     """Return a line if a scale that certainly differs from 1 explains most of the error."""
     spread = 100 * _spread_m(errors)
     rigid, scaled = errors.ate_rmse_cm, errors.ate_rmse_sim3_cm
-    if errors.scale <= 0 or spread == 0:
+    if errors.scale <= 0 or spread == 0 or scaled > SMALL_RESIDUAL * spread:
         return []
     uncertain = max(3 * scaled / spread, SCALE_DIFFERS)
     if abs(np.log(errors.scale)) < uncertain or scaled > CLEARLY_BETTER * rigid:

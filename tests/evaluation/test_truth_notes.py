@@ -57,6 +57,17 @@ def test_estimate_that_is_wrong_is_not_the_truths_fault() -> None:
     assert notes_of(drifting, path_of()) == []
 
 
+@pytest.mark.parametrize("extent", [0.0, 1e-25, 1e-8, 1e-6, 1e-4])  # m
+def test_turn_on_the_spot_has_no_scale(extent: float) -> None:
+    random = np.random.default_rng(1)
+    truth = path_of(extent * POSITIONS)
+    estimate = path_of(extent * POSITIONS + 2e-4 * random.standard_normal((NUM, 3)))
+    errors = trajectory_errors(estimate, truth)
+    assert not any("scale" in line for line in truth_notes(estimate, truth, errors))
+    if extent < 1e-7:
+        assert errors.scale == 1
+
+
 def test_scale_that_explains_the_error_is_named() -> None:
     [line] = notes_of(
         path_of(POSITIONS / 5 + 1e-3 * np.random.default_rng(0).normal(size=(NUM, 3))), path_of()
