@@ -17,6 +17,7 @@ from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.tracking.uncertainty import absolute_covariances, sigmas
 from edslam_ti.trajectory import Trajectory
 
+UNCERTAIN_SHARE, UNCERTAIN = 0.25, 0.03  # of the path's extent, and metres: larger sigmas are named
 MOST_LOST = 0.1  # share of the frames: beyond, the path cannot be relied on
 COLUMNS = (
     *("timestamp_s", "tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"),
@@ -71,7 +72,24 @@ class Trust:
                 f"{self.lost_share:.0%} of the frames were lost ({commonest}); their poses are predicted, "
                 "not measured"
             )
-        return lines
+        return lines + self._uncertain()
+
+    def _uncertain(self) -> list[str]:
+        """Return a line where what was seen does not determine the path."""
+        if not self.is_measured:
+            return []
+        position, positions = self.sigmas[0], self.trajectory.poses[:, :3, 3]
+        extent = float(np.linalg.norm(positions - positions[0], axis=1).max())
+        is_tracked = np.array([r.converged for r in self.results])
+        uncertain = np.flatnonzero(is_tracked & (position > max(UNCERTAIN_SHARE * extent, UNCERTAIN)))
+        if len(uncertain) == 0:
+            return []
+        first, largest = self.trajectory.timestamps[uncertain[0]], position.max()
+        size = f"{largest:.2g} m" if largest < extent else "more than the whole path"
+        return [
+            f"the path is not determined from {first:.3f} s on (standard deviation up to {size}): too little "
+            "texture or structure was in view"
+        ]
 
     def metrics(self) -> dict[str, Any]:
         """Return what metrics.json says of it; None where nothing is known."""

@@ -18,6 +18,9 @@ SMALLEST_FLOW = 0.6  # px of brightness images, at least
 TIMES_USUAL = 5.0  # and so many times what is usual,
 WORSE = 1.1  # and the misfit of brightness with depth is so many times that without,
 FAR_FLOW, FAR_TIMES_USUAL = 1.2, 20.0  # or merely not smaller, if the poses are as far apart as that.
+# A smaller misfit (median, log brightness) is that of pixels where nothing changes: few pixels have texture,
+# and brightness alone does not determine a pose that depth could be measured by.
+SMALLEST_MISFIT = 0.01
 
 UNUSUAL = 1.15  # times the usual misfit, from which on a frame is looked at
 FITS = 1.6  # times the usual misfit: up to there brightness alone may stand for a frame lost with depth
@@ -29,6 +32,8 @@ MOST_SETS = 21  # of frames that are tried; beyond, one frame after the other
 
 def is_contradiction(flow: float, usual: float, misfit: float, misfit_without: float) -> bool:
     """Return whether depth is of another time, by the flow between both poses and by both misfits."""
+    if misfit < SMALLEST_MISFIT:
+        return False
     if flow > max(FAR_FLOW, FAR_TIMES_USUAL * usual):
         return misfit > misfit_without
     return flow > max(SMALLEST_FLOW, TIMES_USUAL * usual) and misfit > WORSE * misfit_without

@@ -11,14 +11,13 @@ import numpy as np
 
 from edslam_ti.alignment import mean_cost
 from edslam_ti.geometry import inverse
-from edslam_ti.tracking.depth_check import SMALLEST_FLOW, sets_to_try
+from edslam_ti.tracking.depth_check import SMALLEST_FLOW, SMALLEST_MISFIT, sets_to_try
 from edslam_ti.tracking.keyframes import BrightnessFrame, BrightnessKeyframe
 from edslam_ti.tracking.segment import Segment
 from edslam_ti.trajectory import PathDraft, Trajectory
 
 BETTER = 0.8  # share of the misfit of all frames to which it falls at least where depth is left out
-FEWEST = 2  # frames whose depth is kept
-MOST_LEFT_OUT = 3  # frames whose depth is not
+MOST_LEFT_OUT = 3  # frames whose depth is, and always less than half of them
 SETTLED_FLOW = 0.25  # px: where no pose is farther from that by brightness alone, nothing contradicts
 ROUNDS = 2  # in which images and poses are solved for
 CAREFUL_ROUNDS = 5  # the same where the first poses are partly of wrong depth
@@ -57,7 +56,7 @@ def first_image(segment: Segment, path: PathDraft) -> FirstImage | None:
         return None
     by_surfaces = {f.index: path.pose(f.index) for f in segment.recent}
     found = _solved(segment, path, ROUNDS, frozenset())
-    if max(found.flows) <= SMALLEST_FLOW:
+    if max(found.flows) <= SMALLEST_FLOW or found.misfit() < SMALLEST_MISFIT:
         return found
     state = segment.aligner.random_state
     best = _without_wrong_depth(found, by_surfaces)
@@ -101,7 +100,8 @@ def _without_wrong_depth(found: FirstImage, by_surfaces: dict[int, np.ndarray]) 
     Brightness must fit far better without them. Where no set of frames is such, all depth stays.
     """
     enough, with_depth = BETTER * found.misfit(), [f.index for f in found.segment.with_depth]
-    most, promising = min(MOST_LEFT_OUT, len(with_depth) - FEWEST), frozenset[int]()
+    minority = (len(with_depth) - 1) // 2  # where more contradict, it is brightness that is in doubt
+    most, promising = min(MOST_LEFT_OUT, minority), frozenset[int]()
     for number in range(1, most + 1):
         sets = sets_to_try(with_depth, number, promising)
         trials = [(trial.misfit(), trial) for trial in (_trial(found, by_surfaces, s) for s in sets)]

@@ -1,6 +1,7 @@
 """poses.csv, and what a run says of its own poses."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,17 @@ def test_lost_frames_are_reported_with_their_commonest_reason(
     assert trust.lost_share == len(dark) / len(tiny_samples)
     (line,) = trust.problems
     assert "of the frames were lost (too few events, and no depth to align instead)" in line
+
+
+def test_a_path_that_is_not_determined_is_said_to_be(clean: Slam) -> None:
+    results = list(clean.results)
+    index = next(k for k in range(6, len(results)) if results[k].measurement is not None)
+    known = results[index].measurement
+    assert known is not None
+    results[index] = replace(results[index], measurement=replace(known, covariance=np.eye(6)))
+    (line,) = Trust(clean.trajectory, results, None).problems
+    start = f"the path is not determined from {clean.trajectory.timestamps[index]:.3f} s on"
+    assert line.startswith(start)
 
 
 def test_a_tracker_that_does_not_measure_has_no_sigma(

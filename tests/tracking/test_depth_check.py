@@ -21,6 +21,7 @@ def test_a_contradiction_is_far_beyond_what_is_usual_and_fits_worse() -> None:
     assert not is_contradiction(flow=2.0, usual=0.7, misfit=0.09, misfit_without=0.05)  # usual
     assert not is_contradiction(flow=0.9, usual=0.05, misfit=0.051, misfit_without=0.05)  # fits as well
     assert is_contradiction(flow=1.8, usual=0.02, misfit=0.051, misfit_without=0.05)  # but far away
+    assert not is_contradiction(flow=1.8, usual=0.02, misfit=0.002, misfit_without=0.001)  # hardly a texture
     assert not is_contradiction(
         flow=1.8, usual=0.02, misfit=0.049, misfit_without=0.05
     )  # brightness is wrong
