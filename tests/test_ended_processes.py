@@ -15,7 +15,12 @@ from killed_runs import ROOT, folder_in, new_run
 from edslam_ti.trajectory import read_tum
 
 pytestmark = pytest.mark.slow
-PROGRAM = [sys.executable, "-c", "from edslam_ti.commands import main; main()", "slam"]
+# Signals act as in a terminal, also where these tests run in the background or under nohup.
+AS_IN_A_TERMINAL = (
+    "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+    "signal.signal(signal.SIGINT, signal.default_int_handler); "
+)
+PROGRAM = [sys.executable, "-c", f"{AS_IN_A_TERMINAL}from edslam_ti.commands import main; main()", "slam"]
 
 
 def start(arguments: list[str], stdout: int = subprocess.PIPE) -> "subprocess.Popen[str]":
