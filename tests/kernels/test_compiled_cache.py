@@ -40,7 +40,8 @@ def run(
 
 
 def changed(environment: dict[str, str | None]) -> dict[str, str]:
-    values = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    # Taichi in debug mode ends itself at a crash, and does not leave it to the signal.
+    values = {**os.environ, "PYTHONPATH": str(ROOT), "TI_DEBUG": None, **environment}
     return {name: value for name, value in values.items() if value is not None}
 
 
