@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from saved_results import CAMERA, curve
 
-from edslam_ti.camera import Camera
 from edslam_ti.errors import EdSlamError
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.trajectory import Trajectory
@@ -20,17 +19,6 @@ from edslam_ti.viewer import (
     frustum_lines,
     path_lines,
 )
-
-CAMERA = Camera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
-
-
-def curve(count: int = 40) -> Trajectory:
-    times = np.linspace(0, 2, count)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, 3] = np.stack([np.sin(times), 0.1 * times, 0.3 * np.cos(2 * times)], -1)
-    poses[:, :3, :3] = Rotation.from_rotvec(times[:, None] * [0, 0.2, 0]).as_matrix()
-    return Trajectory(times, poses)
-
 
 PATH = curve()
 

@@ -56,7 +56,7 @@ def first_image(segment: Segment, path: PathDraft) -> FirstImage | None:
         return None
     by_surfaces = {f.index: path.pose(f.index) for f in segment.recent}
     found = _solved(segment, path, ROUNDS, frozenset())
-    if max(found.flows) <= SMALLEST_FLOW or found.misfit() < SMALLEST_MISFIT:
+    if max(found.flows) <= SMALLEST_FLOW:
         return found
     state = segment.aligner.random_state
     best = _without_wrong_depth(found, by_surfaces)
@@ -97,15 +97,18 @@ def _contradictions(segment: Segment, keyframe: BrightnessKeyframe, path: PathDr
 def _without_wrong_depth(found: FirstImage, by_surfaces: dict[int, np.ndarray]) -> FirstImage:
     """Return the first image without the depth of the fewest frames that leave no contradiction.
 
-    Brightness must fit far better without them. Where no set of frames is such, all depth stays.
+    Brightness must fit far better without them. All depth stays where no set of frames is such, or where
+    there is hardly a misfit to judge by.
     """
-    enough, with_depth = BETTER * found.misfit(), [f.index for f in found.segment.with_depth]
+    misfit, with_depth = found.misfit(), [f.index for f in found.segment.with_depth]
+    if misfit < SMALLEST_MISFIT:
+        return found
     minority = (len(with_depth) - 1) // 2  # where more contradict, it is brightness that is in doubt
     most, promising = min(MOST_LEFT_OUT, minority), frozenset[int]()
     for number in range(1, most + 1):
         sets = sets_to_try(with_depth, number, promising)
         trials = [(trial.misfit(), trial) for trial in (_trial(found, by_surfaces, s) for s in sets)]
-        settled = [t for t in trials if t[0] < enough and max(t[1].flows) < SETTLED_FLOW]
+        settled = [t for t in trials if t[0] < BETTER * misfit and max(t[1].flows) < SETTLED_FLOW]
         if settled:
             return min(settled, key=lambda t: t[0])[1]
         promising = min(trials, key=lambda t: t[0])[1].left_out
