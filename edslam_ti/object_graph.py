@@ -10,7 +10,6 @@ listed, and no code of a class is run.
 import functools
 import importlib
 import inspect
-import json
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -318,8 +317,3 @@ def _class(name: str) -> type:
     if not isinstance(found, type) or found.__module__ != module:
         raise StateError(f"{name}: no class that is state of a run")
     return found
-
-
-def to_json(graph: Graph) -> str:
-    """Return all but the arrays."""
-    return json.dumps({"root": graph.root, "nodes": graph.nodes}, separators=(",", ":"))
