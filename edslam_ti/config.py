@@ -238,10 +238,14 @@ class Config(Stage):
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
     dataset: str | None = None
-    """Input format: event_replica, rpg, rgbd, builtin; omitted: detected from the files in the data
+    """Input format: event_replica, rpg, vector, rgbd, builtin; omitted: detected from the files in the data
     folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
+    depth_dir: Path | None = None
+    """Folder with depth images to use instead of the recording's own, or where it has none (docs/data.md)."""
+    crop: bool = False
+    """Use the part of the recording that published evaluations use (vector)."""
     method: str = "ed_slam"
     """Method to run: a tracker and a mapper."""
     start: float = Field(0.0, ge=0)

@@ -22,6 +22,7 @@ from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence,
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
 from edslam_ti.datasets.rgbd import RgbdSequence, is_rgbd
 from edslam_ti.datasets.rpg import RpgSequence, is_rpg
+from edslam_ti.datasets.vector import VectorSequence, is_vector
 from edslam_ti.errors import ConfigError
 
 __all__ = [
@@ -87,6 +88,11 @@ FORMATS: dict[str, Format] = {
         "RPG Event Camera Dataset's layout, with events.txt",
         lambda folder, config: RpgSequence(folder),
         is_rpg,
+    ),
+    "vector": Format(
+        "VECtor benchmark's layout, with <name>.synced.left_event.hdf5",
+        lambda folder, config: VectorSequence(folder, config.crop, config.depth_dir is None),
+        is_vector,
     ),
     "rgbd": Format(
         "layouts of TUM RGB-D, of NICE-SLAM's Replica and of 7-Scenes, without events",
