@@ -97,7 +97,7 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": ["config", "arguments", "checkpoint", "command_line", "simulation", "datasets"],
     "yaml": ["config", "datasets"],
-    "scipy": ["trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"],
+    "scipy": ["datasets", "trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"],
     "cv2": [
         *(
             "alignment",
@@ -121,8 +121,8 @@ LIBRARIES: dict[str, list[str]] = {
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
     "matplotlib": ["results"],
-    "h5py": ["event_files"],
-    "hdf5plugin": ["event_files"],
+    "h5py": ["event_files", "datasets"],
+    "hdf5plugin": ["event_files", "datasets"],
     "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
 }

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from edslam_ti.errors import DataError
-from edslam_ti.tables import read_table
+from edslam_ti.tables import read_table, text_lines
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,13 @@ def in_order(
     return ImuData(times[kept], angular_velocity[kept], acceleration[kept])
 
 
-def read_imu_text(path: Path, columns: int, line: str, ticks: float = 1.0) -> ImuData:
-    """Return a text of lines 't gx gy gz ax ay az ...' with `columns` numbers; `ticks` of t in a second."""
-    rows = read_table(path, columns, line).rows
+def read_imu_text(path: Path, columns: int | tuple[int, ...], line: str, ticks: float = 1.0) -> ImuData:
+    """Return a text of lines 't gx gy gz ax ay az ...' of `columns` numbers, `ticks` of t in a second.
+
+    Several numbers of columns mean that any of them is accepted.
+    """
+    choices = (columns,) if isinstance(columns, int) else columns
+    _, first = next(text_lines(path, f"expected lines '{line}'"), (0, ""))
+    number = len(first.split())
+    rows = read_table(path, number if number in choices else choices[-1], line).rows
     return in_order(rows[:, 0] / ticks, rows[:, 1:4], rows[:, 4:7])

@@ -49,13 +49,13 @@ class RpgSequence(EventDepthSequence):
     dataset = "rpg"
     contrast_threshold = None
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, needs_depth: bool = True) -> None:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
         self.scene = folder.name
         K = _calibration(folder / "calib.txt")
         image_times, image_files = read_timed_paths(folder / "images.txt", "which also give depth its times")
-        depth, depth_folder = _depth_files(folder, len(image_times))
+        depth, depth_folder = _depth_files(folder, len(image_times), needs_depth)
         width, height = first_image_size(image_files or list(depth.values()))
         try:
             self.camera = Camera(width, height, *(float(v) for v in K[:4]))
@@ -77,7 +77,8 @@ class RpgSequence(EventDepthSequence):
         self.image_timestamps = image_times - self.time_offset
         self.depth_timestamps = image_times[list(depth)] - self.time_offset
         check_clock(self, folder, "images.txt", self.image_timestamps)
-        note_coverage(self)
+        if depth:
+            note_coverage(self)
         self.truth = None
         if (folder / "groundtruth.txt").exists():
             truth = read_tum(folder / "groundtruth.txt", self.notes)
@@ -111,7 +112,7 @@ def _calibration(path: Path) -> np.ndarray:  # [9] fx fy cx cy k1 k2 p1 p2 k3
     return np.asarray(rows[0])
 
 
-def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:
+def _depth_files(folder: Path, num_times: int, needs_depth: bool) -> tuple[dict[int, Path], str]:
     """Return the depth images by the index of their time, and the name of their folder."""
     for name in ("depth", "derived_depth"):
         files = numbered_files(folder / name, "*", (".png",))
@@ -122,9 +123,11 @@ def _depth_files(folder: Path, num_times: int) -> tuple[dict[int, Path], str]:
             )
         if files:
             return files, name
+    if not needs_depth:
+        return {}, "depth"
     raise DataError(
         f"{folder}: no depth found; expected depth/*.png or derived_depth/*.png (16 bits, undistorted, "
-        "numbered as the lines of images.txt)"
+        "numbered as the lines of images.txt), or --depth-dir FOLDER"
     )
 
 
