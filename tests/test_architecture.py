@@ -107,6 +107,7 @@ LIBRARIES: dict[str, list[str]] = {
             "alignment",
             "identity",
             "depth_images",
+            "event_files",
             "datasets",
             "simulation",
             "event_images",
@@ -126,6 +127,8 @@ LIBRARIES: dict[str, list[str]] = {
     "matplotlib": ["results"],
     "h5py": ["event_files"],
     "hdf5plugin": ["event_files"],
+    "rosbags": ["event_files"],
+    "aedat": ["event_files"],
     "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
 }
