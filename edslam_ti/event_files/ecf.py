@@ -1,7 +1,7 @@
 """Decodes chunks of HDF5 files compressed with Prophesee's ECF, HDF5 filter 0x8ECF.
 
-A chunk is a word of 32 bits (number of events, and in its lowest bits how the rest is stored), the first stamp
-in 64 bits, and then:
+A chunk is a word of 32 bits (number of events, and in its lowest bits how the rest is stored), the first
+stamp in 64 bits, and then:
 
     stamps      bytes of step and count, 4 bits each; count 15: two more bytes hold it; step 15: the count
                 bits are part of a longer step, lowest bits first
@@ -73,7 +73,7 @@ def decoded(data: bytes) -> np.ndarray:  # [N] EVENT
         events["y"], events["x"] = packed >> 12 & 0x7FF, packed >> 1 & 0x7FF
         events["p"] = packed & 1
         return events
-    words = np.frombuffer(data, "<u2", (len(data) - at) // 2, at)
+    words = np.frombuffer(data, "<u2", min((len(data) - at) // 2, 2 * number), at)
     y, used = _runs(words >> 5, (words & 0x1F).astype(np.int64), 31, words[1:].astype(np.int64), 1, number)
     events["y"] = y
     at += 2 * used
@@ -83,20 +83,28 @@ def decoded(data: bytes) -> np.ndarray:  # [N] EVENT
         packed = np.stack(values, 1).ravel()[:number]
         events["x"], events["p"] = packed >> 1, packed & 1
         return events
-    words = np.frombuffer(data, "<u2", (len(data) - at) // 2, at)
+    words = np.frombuffer(data, "<u2", min((len(data) - at) // 2, number), at)
     events["x"], used = _masked(words, number)
     at += 2 * used
-    values = np.frombuffer(data, np.uint8, len(data) - at, at)
-    counts = (values & 0x7F).astype(np.int64)
-    events["p"], _ = _runs(values >> 7, counts, 127, _two_bytes(values), 2, number)
+    marks = np.frombuffer(data, np.uint8, len(data) - at, at)
+    counts = (marks & 0x7F).astype(np.int64)
+    events["p"], _ = _runs(marks >> 7, counts, 127, _two_bytes(marks), 2, number)
     return events
 
 
 def _stamps(data: bytes, number: int) -> tuple[np.ndarray, int]:
     """Return stamps [number], and where the bytes that follow begin."""
-    start = 12
     first = int(np.frombuffer(data, "<i8", 1, 4)[0])
-    values = np.frombuffer(data, np.uint8, len(data) - start, start)
+    whole = np.frombuffer(data, np.uint8, len(data) - 12, 12)
+    for length in (number // 8 + 64, number + 64, len(whole)):  # it is not stored how long they are
+        found = _stamps_of(whole[:length], first, number)
+        if found is not None:
+            return found[0], 12 + found[1]
+    raise ValueError(f"the chunk ends before the stamps of its {number} events")
+
+
+def _stamps_of(values: np.ndarray, first: int, number: int) -> tuple[np.ndarray, int] | None:
+    """Return stamps [number] and the bytes they take; None: there are too few bytes."""
     step, count = (values >> 4).astype(np.int64), (values & 0xF).astype(np.int64)
     is_long = step == 15
     is_start, count = _tokens(count, 15, _two_bytes(values), 2, is_never=is_long)
@@ -109,10 +117,10 @@ def _stamps(data: bytes, number: int) -> tuple[np.ndarray, int]:
     counts = np.where(is_start & ~is_long, count, 0)
     total = np.cumsum(counts)
     used = int(np.searchsorted(total, number)) + 1
-    if used > len(values):
-        raise ValueError(f"stamps of {total[-1] if len(total) else 0} events, not {number}")
+    if used + 2 > len(values):
+        return None
     stamps = np.repeat(first + np.cumsum(steps[:used]), counts[:used])[:number]
-    return stamps, start + used + (2 if values[used - 1] & 0xF == 15 else 0)
+    return stamps, used + (2 if values[used - 1] & 0xF == 15 else 0)
 
 
 def _two_bytes(values: np.ndarray) -> np.ndarray:  # [N] uint8 -> [N - 1] int64

@@ -129,17 +129,18 @@ def _decoder(header: PropheseeHeader, words: np.ndarray) -> VectorDecoder | Evt2
 def _are_halves_swapped(words: np.ndarray) -> bool:  # [N] uint64
     """Return whether the type of 64-bit words is in the half that comes first (IMX636).
 
-    Stamps tell: their high parts increase in the right half alone.
+    In that half all types are known, and the high parts of the stamps increase.
     """
     first, second = np.ascontiguousarray(words).view("<u4").reshape(-1, 2).T
-    first_time, second_time = (half[half >> 28 == 8] & 0xFFF_FFFF for half in (first, second))
-    if len(first_time) == 0 or len(second_time) == 0:
-        return len(first_time) > 0
-    return bool(_disorder(first_time) <= _disorder(second_time))
+    return _disorder(first) <= _disorder(second)
 
 
-def _disorder(stamps: np.ndarray) -> float:
-    return float((stamps[1:] < stamps[:-1]).mean()) if len(stamps) > 1 else 1.0
+def _disorder(half: np.ndarray) -> float:  # [N] uint32
+    kind = half >> 28
+    stamps = half[kind == 8] & 0xFFF_FFFF
+    is_constant = len(stamps) == 0 or stamps.min() == stamps.max()
+    backward = 1.0 if is_constant else float((stamps[1:] < stamps[:-1]).mean())
+    return float(np.isin(kind, Evt2Decoder.unknown).mean()) + backward
 
 
 def is_prophesee(path: Path) -> bool:
