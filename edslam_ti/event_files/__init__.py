@@ -87,7 +87,7 @@ def open_events(
 def _decoded(
     rows: DecodedRows, stated: tuple[int, int] | None, size: tuple[int, int] | None, progress: Progress | None
 ) -> EventStream:
-    return EventFile.of(rows, _known(rows.name, size or stated), stated, progress)
+    return EventFile.of(rows, _known(rows.name, size or stated), stated, rows.opening_notes, progress)
 
 
 def _in_place(columns: EventColumns, size: tuple[int, int] | None) -> EventStream:

@@ -26,7 +26,8 @@ def is_aedat4(path: Path) -> bool:
 
 def aedat4_streams(path: Path) -> dict[str, str]:
     """Return what a file holds by the number of the stream: "events", "frame", "imus" or "triggers"."""
-    return {str(number): stream["type"] for number, stream in _opened(path).id_to_stream().items()}
+    streams = _opened(path).id_to_stream()
+    return {str(number): streams[number]["type"] for number in sorted(streams)}
 
 
 def aedat4_rows(path: Path, group: str | None) -> tuple[DecodedRows, tuple[int, int] | None]:
@@ -41,7 +42,7 @@ def aedat4_rows(path: Path, group: str | None) -> tuple[DecodedRows, tuple[int, 
         most_events=path.stat().st_size // BYTES_PER_EVENT,
         part=f"stream {stream}",
     )
-    rows.fixed_notes = notes
+    rows.opening_notes = notes
     return rows, size
 
 

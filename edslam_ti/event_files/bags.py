@@ -159,7 +159,7 @@ def bag_rows(path: Path, group: str | None) -> tuple[DecodedRows, tuple[int, int
         most_events=size // BYTES_PER_EVENT,
         part=topic,
     )
-    rows.fixed_notes = notes
+    rows.opening_notes = notes
     return rows, first.size
 
 

@@ -65,12 +65,13 @@ class EventFile:
         source: EventSource,
         size: tuple[int, int],  # by which events are checked
         stated: tuple[int, int] | None,  # size that the file states
+        notes: list[str],  # sentences for the user about the opening, that the copy does not hold
         progress: Progress | None = None,
     ) -> "EventFile":
         """Return the events of any source."""
         result = cls.__new__(cls)
         result._open(source, size, progress)
-        result.size = stated
+        result.size, result.notes = stated, (*notes, *result.notes)
         return result
 
     def _open(self, source: EventSource, size: tuple[int, int], progress: Progress | None) -> None:

@@ -34,7 +34,7 @@ class DecodedRows:
         self.name = f"{path} ({part})" if part else str(path)
         self.clock = clock
         self.notes: list[str] = []
-        self.fixed_notes: list[str] = []  # those that hold for every reading
+        self.opening_notes: list[str] = []  # about the choice of the camera and its clock
         self._parts = parts
         self._most_events = most_events
         self._origin: float | None = None
@@ -60,7 +60,7 @@ class DecodedRows:
     def blocks(self) -> Iterator[RowBlock]:
         """Yield blocks of about `BLOCK` rows, however long the decoder's parts are."""
         origin = self.origin
-        self.notes = list(self.fixed_notes)
+        self.notes = []
         number, waiting, length = 0, list[np.ndarray](), 0
         share = 0.0
         for raw, share in self._parts(self):

@@ -55,8 +55,8 @@ def test_both_orders_of_the_halves_of_evt21_are_read(
 
 
 @pytest.mark.parametrize(
-    ("version", "start"),
-    [("3.0", (1 << 24) - 1000), ("3.0", 5 * (1 << 24) - 1000), ("2.0", (1 << 34) - 1000)],
+    ("version", "bits", "start"),
+    [("3.0", 24, 15_777_216), ("3.0", 24, 100_000_000), ("2.0", 34, 17_179_868_184)],
 )
 def test_stamps_go_on_when_the_counter_starts_again(
     tmp_path: Path, version: str, bits: int, start: int
