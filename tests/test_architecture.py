@@ -104,6 +104,7 @@ LIBRARIES: dict[str, list[str]] = {
             "identity",
             "depth_images",
             "lenses",
+            "event_files",
             "datasets",
             "simulation",
             "event_images",
@@ -123,6 +124,8 @@ LIBRARIES: dict[str, list[str]] = {
     "matplotlib": ["results"],
     "h5py": ["event_files", "datasets"],
     "hdf5plugin": ["event_files", "datasets"],
+    "rosbags": ["event_files"],
+    "aedat": ["event_files"],
     "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
 }
