@@ -21,6 +21,7 @@ from edslam_ti.config import Config
 from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence, WrappedSequence
 from edslam_ti.datasets.dsec import DsecSequence, is_dsec
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
+from edslam_ti.datasets.evslam import EvslamSequence, is_evslam
 from edslam_ti.datasets.m3ed import M3edSequence, is_m3ed
 from edslam_ti.datasets.mvsec import MvsecSequence, is_mvsec
 from edslam_ti.datasets.other_depth import OtherDepth
@@ -122,6 +123,11 @@ FORMATS: dict[str, Format] = {
         "M3ED's layout, with <name>_data.h5",
         lambda folder, config: M3edSequence(folder, config.depth_dir is None),
         is_m3ed,
+    ),
+    "evslam": Format(
+        "EvSLAM's layout, with <name>.bag and calib_results_cam.txt",
+        lambda folder, config: EvslamSequence(folder, config.depth_dir is None),
+        is_evslam,
     ),
     "rgbd": Format(
         "layouts of TUM RGB-D, of NICE-SLAM's Replica and of 7-Scenes, without events",

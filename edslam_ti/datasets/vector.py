@@ -2,6 +2,7 @@
 
     <name>.synced.left_event.hdf5        DSEC's layout, 640x480, distorted
     <name>.synced.kinect_depth/<s>.png   16 bits, mm, 640x576, in the Kinect's own depth camera
+    (or .left_event.bag, .kinect_depth.bag)
     <name>.synced.left_event_depth/<s>.png    mm, reprojected and undistorted (k4a_projector); used if
                                               there is no kinect_depth
     <name>.synced.left_camera/<s>.png, timestamp.txt    grey 1224x1024; start and end of exposure [s]
@@ -19,6 +20,7 @@ al. 2024).
 
 from pathlib import Path
 
+from edslam_ti.datasets.bag_depth import depth_of_bag
 from edslam_ti.datasets.depth import DepthFormat, read_depth
 from edslam_ti.datasets.files import read_numbers, timed_files
 from edslam_ti.datasets.imu import read_imu_text
@@ -30,7 +32,7 @@ from edslam_ti.event_files import open_events
 from edslam_ti.lenses import Undistortion
 from edslam_ti.trajectory import read_tum
 
-EVENT_FILES = "*.synced.left_event.h*5"
+EVENT_FILES = ("*.synced.left_event.h*5", "*.synced.left_event.bag")
 LARGE_SCALE = ("corridors", "units", "school")  # recorded with a lidar, without the Kinect
 MILLIMETRES = DepthFormat(0.001)
 # First and last grey image that evaluations use (DEVO); None: to the end but for one image.
@@ -95,6 +97,9 @@ class VectorSequence(Recording):
     def _find_depth(self, name: str, calibration: VectorCalibration, is_large: bool) -> None:
         raw, drawn = (self._folder / f"{name}.synced.{kind}" for kind in ("kinect_depth", "left_event_depth"))
         times, files = timed_files(raw, (".png",))
+        bag = raw.with_name(f"{raw.name}.bag")
+        if not files and not is_large and bag.is_file():
+            times, files = depth_of_bag(bag, "/kinect/depth_image")
         if files and not is_large:
             lens = calibration.lenses[DEPTH]
             reprojection = DepthReprojection(lens, self.camera, calibration.between(EVENT, DEPTH))
@@ -123,7 +128,7 @@ class VectorSequence(Recording):
 
 
 def _event_file(folder: Path) -> Path:
-    found = sorted(folder.glob(EVENT_FILES))
+    found = next((f for f in (sorted(folder.glob(pattern)) for pattern in EVENT_FILES) if f), [])
     if not found:
         raise FileNotFoundError(f"{folder}: no events found; expected <name>.synced.left_event.hdf5")
     if len(found) > 1:
@@ -135,4 +140,4 @@ def _event_file(folder: Path) -> Path:
 
 def is_vector(folder: Path) -> bool:
     """Return whether a folder holds events where this layout has them."""
-    return any(folder.glob(EVENT_FILES))
+    return any(any(folder.glob(pattern)) for pattern in EVENT_FILES)

@@ -204,3 +204,21 @@ def test_bad_calibration_is_refused_in_one_line(copy: Path, name: str, text: str
         VectorSequence(copy)
     assert name in str(caught.value)
     assert str(caught.value).isprintable()
+
+
+def test_bags_are_read_instead_of_unpacked_files(copy: Path, sequence: VectorSequence) -> None:
+    from event_files.written_bags import BagWriter
+
+    raw = copy / "desk_normal1.synced.kinect_depth"
+    with BagWriter(copy / "desk_normal1.synced.kinect_depth", "bag") as bag:
+        for path in sorted(raw.glob("*.png")):
+            bag.image(
+                "/kinect/depth_image",
+                round(float(path.stem) * 1e6) * 1000,
+                cv2.imread(str(path), -1),
+                "16UC1",
+            )
+    shutil.rmtree(raw)
+    other = VectorSequence(copy)
+    assert other.depth_timestamps == pytest.approx(sequence.depth_timestamps, abs=1e-6)
+    assert (other.depth(3) == sequence.depth(3)).all()
