@@ -10,7 +10,7 @@ from edslam_ti.event_files.stream import Clock, RawEvents
 
 EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 TYPES = (0x00, 0x0C)  # Event2D and CD
-LOOK_EVERY = 100_000  # events; stamps begin again at 0 after 2^32 us, which takes more of them
+LOOK_EVERY = 1_000_000  # events; stamps begin again at 0 after 2^32 us, which takes more of them
 TURN = 1 << 32  # us
 
 
@@ -38,14 +38,14 @@ class DatColumns:
             raise DataError(f"{path}: expected events, got none")
         if rest:
             self.notes.append(f"the last event is cut off and left out ({rest} of {EVENT.itemsize} bytes)")
-        self._rows = np.memmap(path, EVENT, "r", start, (self._length,)).view(np.ndarray)
+        self._start = start  # bytes
         self._turns = self._found_turns()
 
     def __len__(self) -> int:
         return self._length
 
     def read(self, start: int, end: int) -> RawEvents:
-        rows = np.array(self._rows[start:end])
+        rows = self._rows(start, end)
         address = np.ascontiguousarray(rows["address"])
         t = self._continued(rows["t"], start)
         polarity = ((address >> 28) & 1).astype(np.uint8)
@@ -53,10 +53,17 @@ class DatColumns:
         return RawEvents(x, y, t, polarity)
 
     def times(self, start: int, end: int) -> np.ndarray:  # [M]
-        return self._continued(self._rows["t"][start:end], start)
+        return self._continued(self._rows(start, end)["t"], start)
 
     def near(self, seconds: float) -> int | None:
         return None
+
+    def _rows(self, start: int, end: int) -> np.ndarray:  # [M] EVENT
+        place = self._start + start * EVENT.itemsize
+        return np.fromfile(self.path, EVENT, max(0, end - start), offset=place)
+
+    def _stamp(self, event: int) -> int:
+        return int(self._rows(event, event + 1)["t"][0])
 
     def _continued(self, stamps: np.ndarray, start: int) -> np.ndarray:  # [M] -> [M] int64
         if not self._turns:
@@ -67,13 +74,13 @@ class DatColumns:
     def _found_turns(self) -> list[int]:
         """Return the events with which stamps begin again at 0."""
         places = np.append(np.arange(0, self._length, LOOK_EVERY), self._length - 1)
-        stamps = self._rows["t"][places].astype(np.int64)
+        stamps = np.array([self._stamp(int(place)) for place in places])
         turns = []
         for k in np.flatnonzero(np.diff(stamps) < -TURN // 2):
             first, last = int(places[k]), int(places[k + 1])
             while last - first > 1:
                 middle = (first + last) // 2
-                is_before = int(self._rows["t"][middle]) > TURN // 2
+                is_before = self._stamp(middle) > TURN // 2
                 first, last = (middle, last) if is_before else (first, middle)
             turns.append(last)
         return turns

@@ -1,6 +1,7 @@
 """Writes small AEDAT4 files byte by byte: header, uncompressed packets of events, by DV's schema."""
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 MAGIC = b"#!AER-DAT4.0\r\n"
