@@ -210,14 +210,11 @@ def test_bags_are_read_instead_of_unpacked_files(copy: Path, sequence: VectorSeq
     from event_files.written_bags import BagWriter
 
     raw = copy / "desk_normal1.synced.kinect_depth"
-    with BagWriter(copy / "desk_normal1.synced.kinect_depth", "bag") as bag:
+    with BagWriter(copy / "desk_normal1.synced.kinect_depth.x", "bag") as bag:
         for path in sorted(raw.glob("*.png")):
-            bag.image(
-                "/kinect/depth_image",
-                round(float(path.stem) * 1e6) * 1000,
-                cv2.imread(str(path), -1),
-                "16UC1",
-            )
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert image is not None
+            bag.image("/kinect/depth_image", round(float(path.stem) * 1e6) * 1000, image, "16UC1")
     shutil.rmtree(raw)
     other = VectorSequence(copy)
     assert other.depth_timestamps == pytest.approx(sequence.depth_timestamps, abs=1e-6)
