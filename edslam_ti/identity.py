@@ -19,6 +19,7 @@ from edslam_ti.kernels import engine
 
 HARMLESS = {"checkpoint", "visualize", "out"}  # settings that change no result
 HASHED = 1 << 20  # bytes at either end of a large file
+SHARED = ("*.yaml", "*.json", "*calib*/*.yaml", "*calib*/*.txt")  # in the folder above
 TEXT = {".json", ".txt", ".yaml", ".yml", ".csv"}
 
 
@@ -71,6 +72,18 @@ def _inputs(config: Config) -> dict[str, str]:
     dataset, folder = find_sequence(config)
     if folder is None:
         return {f"{dataset} {config.scene}": __version__}
+    prints = _prints(folder)
+    if config.depth_dir is not None:
+        prints |= {f"depth folder {name}": value for name, value in _prints(config.depth_dir).items()}
+    for pattern in SHARED:  # calibration that several recordings share
+        for file in sorted(folder.resolve().parent.glob(pattern)):
+            if file.is_file():
+                prints[f"../{file.relative_to(folder.resolve().parent)}"] = _ends(file, file.stat().st_size)
+    return prints
+
+
+def _prints(folder: Path) -> dict[str, str]:
+    """Return a fingerprint of a folder's files."""
     prints: dict[str, str] = {}
     for path, _, names in os.walk(folder, followlinks=True):
         images = hashlib.blake2b(digest_size=16)

@@ -21,9 +21,11 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 STDERR = 2  # file descriptor
 
 
-def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, columns] float64
+def read_numbers(
+    path: Path, columns: int, line: str, header_lines: int = 0
+) -> np.ndarray:  # [N, columns] float64
     """Return the table in a text file of `columns` numbers a line; `line` describes one in messages."""
-    return read_table(path, columns, line).rows
+    return read_table(path, columns, line, header_lines).rows
 
 
 def read_timed_paths(path: Path, use: str = "seconds") -> tuple[np.ndarray, list[Path]]:  # [I] s, I files

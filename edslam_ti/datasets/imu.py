@@ -8,6 +8,8 @@ import numpy as np
 from edslam_ti.errors import DataError
 from edslam_ti.tables import read_table, text_lines
 
+HEADER_LINES = 3  # at the top of a text file that may hold words
+
 
 @dataclass(frozen=True)
 class ImuData:
@@ -50,7 +52,11 @@ def read_imu_text(path: Path, columns: int | tuple[int, ...], line: str, ticks: 
     Several numbers of columns mean that any of them is accepted.
     """
     choices = (columns,) if isinstance(columns, int) else columns
-    _, first = next(text_lines(path, f"expected lines '{line}'"), (0, ""))
-    number = len(first.split())
-    rows = read_table(path, number if number in choices else choices[-1], line).rows
+    last = ""
+    for number, text in text_lines(path, f"expected lines '{line}'"):
+        last = text
+        if number > HEADER_LINES:
+            break
+    number = len(last.split())
+    rows = read_table(path, number if number in choices else choices[-1], line, HEADER_LINES).rows
     return in_order(rows[:, 0] / ticks, rows[:, 1:4], rows[:, 4:7])

@@ -34,6 +34,7 @@ from edslam_ti.trajectory import Trajectory, read_tum
 EVENT_FILES = "*events_left.h5"
 LEFT_EVENT = 2  # of the cameras in the calibration
 MICROSECONDS = 1e6
+HEADER_LINES = 1  # of mocap_data.txt
 # Recorded with calibration A (page of the data set); all others with B.
 WITH_A = ("loop-floor", "mocap-desk", "skate-easy")
 
@@ -61,7 +62,7 @@ class TumVieSequence(Recording):
         if poses is not None and markers is None:
             self.note(f"{poses.name} is not used: mocap-imu-calibrationA.json or B is not there")
         if poses is not None and markers is not None:
-            truth = read_tum(poses, self.notes)
+            truth = read_tum(poses, self.notes, HEADER_LINES)
             T_imu_marker = _motion(_value0(markers).get("T_imu_marker"), f"{markers}: T_imu_marker")
             truth = Trajectory(truth.timestamps / MICROSECONDS, truth.poses)
             self.set_truth(truth, poses.name, inverse(T_imu_marker) @ T_imu_camera)

@@ -35,6 +35,7 @@ from edslam_ti.trajectory import read_tum
 EVENT_FILES = ("*.synced.left_event.h*5", "*.synced.left_event.bag")
 LARGE_SCALE = ("corridors", "units", "school")  # recorded with a lidar, without the Kinect
 MILLIMETRES = DepthFormat(0.001)
+HEADER_LINES = 2  # of text files
 # First and last grey image that evaluations use (DEVO); None: to the end but for one image.
 CROPS: dict[str, tuple[int, int | None]] = {
     "corner_slow": (30, 1180),
@@ -81,7 +82,9 @@ class VectorSequence(Recording):
         if truth_file.is_file():
             carrier = LIDAR if is_large else BODY
             self.set_truth(
-                read_tum(truth_file, self.notes), truth_file.name, calibration.between(carrier, EVENT)
+                read_tum(truth_file, self.notes, HEADER_LINES),
+                truth_file.name,
+                calibration.between(carrier, EVENT),
             )
         imu_file = folder / f"{name}.synced.imu.txt"
         if imu_file.is_file():
@@ -118,7 +121,7 @@ class VectorSequence(Recording):
             known = ", ".join(CROPS)
             raise DataError(f"crop: expected one of {known}, got '{plain(name, 60)}'; leave it out")
         stamps = self._folder / f"{name}.synced.left_camera" / "timestamp.txt"
-        exposures = read_numbers(stamps, 2, "start and end of an exposure [s]").mean(1)
+        exposures = read_numbers(stamps, 2, "start and end of an exposure [s]", HEADER_LINES).mean(1)
         start, stop = CROPS[key]
         last = len(exposures) - 2 if stop is None else min(stop, len(exposures)) - 1
         if last <= start:

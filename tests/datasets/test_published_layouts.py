@@ -20,6 +20,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, find_sequence, open_sequence
 from edslam_ti.errors import ConfigError, DataError
+from edslam_ti.identity import identity_of
 from edslam_ti.lenses import Lens
 
 W, H = 48, 36
@@ -368,3 +369,18 @@ def test_missing_depth_is_said_with_what_can_be_done(tmp_path: Path) -> None:
     (tree.folder / "calibration/cam_to_cam.yaml").unlink()
     with pytest.raises(FileNotFoundError, match=r"calibration/cam_to_cam\.yaml not found"):
         opened(tree)
+
+
+def test_a_run_depends_on_depth_folder_and_shared_calibration(tmp_path: Path) -> None:
+    tree = write_tum_vie(tmp_path / "data/mocap-desk2")
+    write_depth_folder(tmp_path / "depth", [0.1, 0.2], tree.lens.best_fit)
+    config = Config(scene="mocap-desk2", data_dir=tmp_path / "data", depth_dir=tmp_path / "depth")
+    before = identity_of(config)["inputs"]
+    (tmp_path / "depth/0.100000.png").touch()
+    after = identity_of(config)["inputs"]
+    assert [name for name in before if before[name] != after[name]] == ["depth folder ."]
+    path = tmp_path / "data/camera-calibrationA.json"
+    path.write_text(path.read_text() + " ")
+    assert (
+        identity_of(config)["inputs"]["../camera-calibrationA.json"] != after["../camera-calibrationA.json"]
+    )

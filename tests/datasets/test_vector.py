@@ -219,3 +219,13 @@ def test_bags_are_read_instead_of_unpacked_files(copy: Path, sequence: VectorSeq
     other = VectorSequence(copy)
     assert other.depth_timestamps == pytest.approx(sequence.depth_timestamps, abs=1e-6)
     assert (other.depth(3) == sequence.depth(3)).all()
+
+
+def test_headers_need_no_comment_sign(copy: Path, sequence: VectorSequence) -> None:
+    for name in ("gt", "imu"):
+        path = copy / f"desk_normal1.synced.{name}.txt"
+        path.write_text(path.read_text().replace("# ", ""))
+    other = VectorSequence(copy)
+    assert (other.truth.timestamps == sequence.truth.timestamps).all()
+    assert other.imu is not None
+    assert len(other.imu) == 100
