@@ -316,3 +316,14 @@ def test_a_bare_switch_is_true() -> None:
     config = parse_config(["--visualize", "--mapping.enabled", "false", "--scene", "room0"])
     assert config.visualize
     assert not config.mapping.enabled
+
+
+def test_ctrl_c_while_the_libraries_end_is_ignored() -> None:
+    code = (
+        "import atexit, os, signal\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "from edslam_ti.command_line import launch\n"
+        "launch(lambda: None)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
