@@ -3,9 +3,10 @@
 import os
 from pathlib import Path
 
+from written_sequences import write_sequence
+
 from edslam_ti.config import Config
 from edslam_ti.identity import identity_of
-from tests.written_sequences import write_sequence
 
 
 def test_pipes_and_links_to_folders_above_are_not_followed(tmp_path: Path) -> None:
