@@ -52,7 +52,7 @@ class Camera:
         if not 1 / FLATTEST_PIXEL <= self.fx / self.fy <= FLATTEST_PIXEL:
             raise DataError(
                 f"camera: expected fx and fy of one lens, at most {FLATTEST_PIXEL:g} times each other, got "
-                f"fx = {self.fx:g}, fy = {self.fy:g}"
+                f"fx = {self.fx:g}, fy = {self.fy:g}; state both, and the size and centre that go with them"
             )
         if abs(self.cx) > FARTHEST_CENTRE * side or abs(self.cy) > FARTHEST_CENTRE * side:
             raise DataError(
