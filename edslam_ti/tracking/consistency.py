@@ -30,7 +30,7 @@ CONTRADICTION = 100.0
 # up to 3.5 standard deviations and 3 ms without a delay, 5.2 and 8 ms with depth 10 ms late.
 SURE, SMALLEST_DELAY = 4.5, 0.004
 # Smallest mean square of residuals that means something. The tiny simulated room gives 0.3, a sixtieth of its
-# events 0.09, one or two hundred events in all 0.01: what few events do not show is taken for even brightness.
+# events 0.09, one or two hundred events in all 0.01: where events are few, brightness seems even.
 SMALLEST_SCALE = 0.1
 HUBER = 1.5  # standard deviations
 FROZEN_SHARE = 0.2  # depth has stopped if this share of the compared frames repeats the previous depth image

@@ -32,7 +32,8 @@ REMEMBERED = 20  # frames
 # Depth of another scale: the median |log| ratio of depths at the same points, seen from two poses.
 OTHER_SCALE = 0.25  # at least, to all frames that agree,
 SAME_SCALE = 0.08  # which differ from one another by less
-MIN_COMMON = 30  # pixels that both frames measure
+MIN_COMMON = 0.02  # share of the pixels that both frames must measure
+COMPARED = 4000  # pixels of a frame, about
 
 MOST_SETS = 21  # of frames that are tried; beyond, one frame after the other
 
@@ -63,14 +64,18 @@ def log_ratio(
 
     It is NaN where hardly any pixel is measured in both.
     """
-    points = camera.back_project(depth) @ T_other_camera[:3, :3].T + T_other_camera[:3, 3]
+    step = max(1, int(np.sqrt(depth.size / COMPARED)))
+    v, u = np.mgrid[0 : depth.shape[0] : step, 0 : depth.shape[1] : step]
+    d = depth[v, u]
+    v, u, d, number = v[d > 0], u[d > 0], d[d > 0], d.size
+    points = camera.back_project_pixels(u, v, d) @ T_other_camera[:3, :3].T + T_other_camera[:3, 3]
     points = points[points[:, 2] > NEAREST]
     u, v, z = camera.project(points)
     column, row = np.rint(u), np.rint(v)
     seen = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     there = other[row[seen].astype(np.intp), column[seen].astype(np.intp)]
     measured = there > 0
-    if np.count_nonzero(measured) < MIN_COMMON:
+    if np.count_nonzero(measured) < MIN_COMMON * number:
         return math.nan
     return float(np.median(np.abs(np.log(z[seen][measured] / there[measured]))))
 

@@ -77,7 +77,14 @@ def test_swapped_depth_images_are_left_out(
     assert all(r.converged for r in slam.results)
 
 
-@pytest.mark.parametrize("change", [lambda d: np.random.default_rng(0).permuted(d), lambda d: 1.1 * d])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: np.random.default_rng(0).permuted(d),
+        lambda d: 1.1 * d,
+        lambda d: np.where(d < np.percentile(d, 20), 10 * d, 0),  # the rest is out of range
+    ],
+)
 def test_a_frame_whose_depth_is_nonsense_has_its_pose_by_brightness(
     tiny_sequence: EventDepthSequence,
     tiny_samples: list[Sample],
