@@ -106,6 +106,10 @@ def parse_config(
 def launch(main: Callable[[], None]) -> None:
     """Run a command; errors that a user can fix print one line on stderr and no traceback."""
     try:
+        os.getcwd()
+    except OSError:  # libraries abort there
+        _exit(FAILED, "the current folder no longer exists; change to another one")
+    try:
         main()
     except UsageError as error:
         _exit(USAGE, f"{error} (--help lists the options)")
