@@ -158,6 +158,9 @@ class MappingConfig(Stage):
     (Sec. IV-A)."""
     max_gaussians: int = Field(300_000, ge=1)
     """Largest number of Gaussians; beyond half of it, the fuller the map, the coarser the new ones."""
+    ply_harmonics: int = Field(0, ge=0, le=3)
+    """Degree of the spherical harmonics in map.ply. Those above 0 are zeros, which some viewers and
+    converters demand: with 3, a file is 3.6 times as large."""
     initial_size: float = Field(0.25, gt=0)
     """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
     initial_opacity: float = Field(0.95, gt=0, lt=1)

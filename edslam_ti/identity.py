@@ -85,14 +85,21 @@ def _inputs(config: Config) -> dict[str, str]:
 def _prints(folder: Path) -> dict[str, str]:
     """Return a fingerprint of a folder's files."""
     prints: dict[str, str] = {}
-    for path, _, names in os.walk(folder, followlinks=True):
+    walked: set[str] = set()
+    for path, folders, names in os.walk(folder, followlinks=True):
+        if os.path.realpath(path) in walked:  # a link to a folder above would never end
+            folders.clear()
+            continue
+        walked.add(os.path.realpath(path))
+        folders.sort()
         images = hashlib.blake2b(digest_size=16)
         for name in sorted(names):
             file = Path(path) / name
             try:
                 status = file.stat()
                 facts = f"{status.st_size} bytes of {status.st_mtime_ns}"
-                if file.suffix.lower() in TEXT or status.st_size > HASHED:
+                is_read = file.suffix.lower() in TEXT or status.st_size > HASHED
+                if is_read and file.is_file():  # reading a pipe or a device would never end
                     prints[str(file.relative_to(folder))] = f"{facts} {_ends(file, status.st_size)}"
                 else:
                     images.update(os.fsencode(f"{name} {facts}\n"))
