@@ -414,7 +414,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "distortion of no lens": (
         _camera(k1=500.0),
-        r"json: expected distortion .* that shows 1 % of the undistorted",
+        r"json: expected distortion .* that shows 4 % of the undistorted",
     ),
 }
 
