@@ -10,8 +10,7 @@ import numpy as np
 from edslam_ti.errors import DataError, MissingExtraError, plain
 from edslam_ti.event_files.choice import chosen
 from edslam_ti.event_files.decoded import DecodedRows, Parts
-from edslam_ti.event_files.hdf5 import INSTALL
-from edslam_ti.event_files.stream import Clock, RawEvents
+from edslam_ti.event_files.stream import INSTALL, Clock, RawEvents
 
 MAGIC = b"#!AER-DAT4.0"
 BYTES_PER_EVENT = 3  # least that compressed events take

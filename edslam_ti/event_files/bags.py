@@ -20,8 +20,7 @@ from edslam_ti.errors import DataError, MissingExtraError, plain
 from edslam_ti.event_files.bag_messages import EventReader, image_of, imu_of, is_packet
 from edslam_ti.event_files.choice import chosen
 from edslam_ti.event_files.decoded import DecodedRows, Parts
-from edslam_ti.event_files.hdf5 import INSTALL
-from edslam_ti.event_files.stream import Clock
+from edslam_ti.event_files.stream import INSTALL, Clock
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 STORAGES = (".db3", ".mcap")  # of ROS 2
