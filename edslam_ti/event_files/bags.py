@@ -86,15 +86,13 @@ def _one_line(path: Path) -> Iterator[None]:
         yield
     except (MissingExtraError, DataError, GeneratorExit):
         raise
-    except MemoryError:
-        raise
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{path}: not a ROS bag ({plain(error)})") from error
     except sqlite3.Error as error:
         raise DataError(
             f"{path}: not readable as a ROS bag ({plain(error)}); copy or download it again"
         ) from error
-    except Exception as error:  # the reader lets errors of its parsers through: struct, lz4, KeyError, ...
+    except Exception as error:  # of the reader's parsers: struct, lz4, KeyError, MemoryError ...
         raise DataError(
             f"{path}: not readable as a ROS bag ({plain(error) or type(error).__name__}); copy it again, or "
             "repair it with 'rosbag reindex' or 'ros2 bag reindex'"

@@ -30,6 +30,7 @@ from edslam_ti.event_files.units import clock_of
 
 INDEX_NAMES = ("ms_to_idx", "ms_map_idx")  # k-th entry: first event at or after k milliseconds
 CACHE = 16_000_000  # bytes of decompressed chunks that are kept for each dataset
+LARGEST_CACHE = 64_000_000  # where a single chunk is longer
 INDEX_SLACK = 1000  # us; an entry further off means that the index belongs to other events
 
 

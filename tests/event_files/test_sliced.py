@@ -107,6 +107,15 @@ def test_opening_reads_a_few_places_only(tmp_path: Path, monkeypatch: pytest.Mon
     assert number[0] <= 3000  # a few blocks
 
 
+def test_long_chunks_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edslam_ti.event_files.hdf5.CACHE", 1000)
+    columns = some_columns()
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        for name, values in columns.items():
+            file.create_dataset(f"events/{name}", data=values, chunks=(COUNT,), compression="gzip")
+    assert (open_events(tmp_path / "e.h5", SIZE).between(0, 3).x == columns["x"]).all()
+
+
 @pytest.mark.parametrize(
     ("coding", "dtype"),
     [((0, 1), "u1"), ((-1, 1), "i1"), ((0, 1), "?"), ((0, 1), "i2"), ((-1, 1), "f4")],
