@@ -12,8 +12,8 @@
 | ROS bags (.bag, .db3, .mcap) | the same |
 | archives of arrays (.npz) | the same |
 
-`open_events` recognises a format by its first bytes, else by its suffix. bags.py and aedat4.py read images and
-IMU of such files, too.
+`open_events` recognises a format by its first bytes, else by its suffix. bags.py and aedat4.py also read
+images and IMU.
 """
 
 import zipfile
