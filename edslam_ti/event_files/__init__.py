@@ -12,7 +12,8 @@
 | ROS bags (.bag, .db3, .mcap) | the same |
 | archives of arrays (.npz) | the same |
 
-`open_events` recognises a format by its first bytes, else by its suffix.
+`open_events` recognises a format by its first bytes, else by its suffix. bags.py and aedat4.py also read
+images and IMU.
 """
 
 import zipfile

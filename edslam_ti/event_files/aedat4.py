@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,7 @@ import numpy as np
 from edslam_ti.errors import DataError, MissingExtraError, plain
 from edslam_ti.event_files.choice import chosen
 from edslam_ti.event_files.decoded import DecodedRows, Parts
-from edslam_ti.event_files.hdf5 import INSTALL
-from edslam_ti.event_files.stream import Clock, RawEvents
+from edslam_ti.event_files.stream import INSTALL, Clock, RawEvents
 
 MAGIC = b"#!AER-DAT4.0"
 BYTES_PER_EVENT = 3  # least that compressed events take
@@ -90,27 +90,34 @@ def _opened(path: Path) -> Any:
         import aedat
     except ModuleNotFoundError as error:
         raise MissingExtraError(f"{path}: AEDAT4 files need {INSTALL}") from error
-    try:
+    with _one_line(path):
         return aedat.Decoder(str(path))
-    except (RuntimeError, OSError, ValueError) as error:
-        raise _damaged(path, error) from error
 
 
 def _packets(path: Path, stream: int) -> Iterator[dict[str, Any]]:
     decoder = iter(_opened(path))
     while True:
-        try:
+        with _one_line(path):
             packet = next(decoder, None)
-        except (RuntimeError, OSError, ValueError) as error:
-            raise _damaged(path, error) from error
         if packet is None:
             return
         if packet["stream_id"] == stream:
             yield packet
 
 
-def _damaged(path: Path, error: Exception) -> DataError:
-    return DataError(f"{path}: not readable as AEDAT4 ({plain(error)}); copy or download it again")
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """Turn what the library raises for a damaged file into one line."""
+    try:
+        yield
+    except BaseException as error:
+        # A panic of its Rust code is no Exception, and its class has no public name.
+        is_panic = type(error).__name__ == "PanicException"
+        if not (is_panic or isinstance(error, (RuntimeError, OSError, ValueError, MemoryError))):
+            raise
+        raise DataError(
+            f"{path}: not readable as AEDAT4 ({plain(error)}); copy or download it again"
+        ) from error
 
 
 def _stream(path: Path, kind: str, wanted: str | None) -> tuple[int, list[str]]:

@@ -34,6 +34,8 @@ class Message:
     """Reads the fields of one message one after the other."""
 
     def __init__(self, data: bytes, is_ros1: bool) -> None:
+        if not isinstance(data, bytes):  # of a damaged database
+            raise DataError(f"should be bytes, got {type(data).__name__}")
         self._data = memoryview(data)
         self._is_ros1 = is_ros1
         self._start = 0 if is_ros1 else 4  # CDR begins with four bytes about itself

@@ -2,12 +2,13 @@
 
 Events are dvs_msgs/EventArray, prophesee_event_msgs/EventArray (the same layout), event_camera_msgs/
 EventPacket or its predecessor event_array_msgs/EventArray, encoded as evt3, libcaer, libcaer_cmp or mono.
-Bags may also hold images (grey or depth) and IMU: `bag_images`, `bag_imu`.
+Bags may also hold images (grey or depth) and IMU: `bag_images`, `bag_imu`, `bag_topics`.
 
 Stamps of events are those of the messages. In evt3 and mono packets they are of the sensor's own clock, which
-starts with the sensor; a note then says how it relates to the clock of the messages' headers.
+starts with the sensor; `sensor_clock_zero` relates it to the clock of the messages' headers.
 """
 
+import itertools
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,12 +21,12 @@ from edslam_ti.errors import DataError, MissingExtraError, plain
 from edslam_ti.event_files.bag_messages import EventReader, image_of, imu_of, is_packet
 from edslam_ti.event_files.choice import chosen
 from edslam_ti.event_files.decoded import DecodedRows, Parts
-from edslam_ti.event_files.hdf5 import INSTALL
-from edslam_ti.event_files.stream import Clock
+from edslam_ti.event_files.stream import INSTALL, Clock
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 STORAGES = (".db3", ".mcap")  # of ROS 2
 BYTES_PER_EVENT = 3  # least that events take in a bag, encoded as evt3
+MEASURED = 200  # messages by which the clocks of sensor and bag are compared
 # Encodings with stamps of the sensor's own clock
 OWN_CLOCK = ("evt3", "mono")
 
@@ -87,15 +88,13 @@ def _one_line(path: Path) -> Iterator[None]:
         yield
     except (MissingExtraError, DataError, GeneratorExit):
         raise
-    except MemoryError:
-        raise
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{path}: not a ROS bag ({plain(error)})") from error
     except sqlite3.Error as error:
         raise DataError(
             f"{path}: not readable as a ROS bag ({plain(error)}); copy or download it again"
         ) from error
-    except Exception as error:  # the reader lets errors of its parsers through: struct, lz4, KeyError, ...
+    except Exception as error:  # of the reader's parsers: struct, lz4, KeyError, MemoryError ...
         raise DataError(
             f"{path}: not readable as a ROS bag ({plain(error) or type(error).__name__}); copy it again, or "
             "repair it with 'rosbag reindex' or 'ros2 bag reindex'"
@@ -141,15 +140,15 @@ def _chosen_topic(path: Path, kind: str, wanted: str | None) -> tuple[str, str, 
 def bag_rows(path: Path, group: str | None) -> tuple[DecodedRows, tuple[int, int]]:
     """Return the events of a topic, and the size of the image that its messages state."""
     topic, type_name, notes = _chosen_topic(path, "events", group)
-    read = EventReader(type_name, path.suffix.lower() == ".bag")
     with Bag(path) as bag:
-        first = next((read(data) for data, _ in bag.messages(topic)), None)
+        read = EventReader(type_name, bag.is_ros1)
+        messages = bag.messages(topic)
+        first = next((_in_topic(f"{path} ({topic})", read, data) for data, _ in messages), None)
     if first is None:
         raise DataError(f"{path} ({topic}): expected messages with events, got none")
-    if read.encoding in OWN_CLOCK and len(first.events):
-        offset = (first.stamp - int(first.events.t[0])) / 1e9
+    if (zero := sensor_clock_zero(path, topic)) is not None:
         notes.append(
-            f"stamps are the sensor's own; its zero is about {offset:.3f} s of the clock of the messages"
+            f"stamps are the sensor's own; its zero is about {zero:.4f} s of the clock of the messages"
         )
     size = sum(file.stat().st_size for file in (_storages(path) if path.is_dir() else [path]))
     rows = DecodedRows(
@@ -161,6 +160,26 @@ def bag_rows(path: Path, group: str | None) -> tuple[DecodedRows, tuple[int, int
     )
     rows.opening_notes = notes
     return rows, first.size
+
+
+def sensor_clock_zero(path: Path, group: str | None = None) -> float | None:
+    """Return the time (s) of the messages' headers at which the clock of the events was at zero.
+
+    Add it to stamps of events to compare them with images and IMU of the bag. Messages are stamped when they
+    arrive, so it is the least of the first `MEASURED` that counts. None: events have the headers' clock.
+    """
+    topic, type_name, _ = _chosen_topic(path, "events", group)
+    least: int | None = None  # ns
+    with Bag(path) as bag:
+        read = EventReader(type_name, bag.is_ros1)
+        for data, _ in itertools.islice(bag.messages(topic), MEASURED):
+            message = _in_topic(f"{path} ({topic})", read, data)
+            if read.encoding not in OWN_CLOCK:
+                return None
+            if len(message.events):
+                zero = message.stamp - int(message.events.t[0])
+                least = zero if least is None else min(least, zero)
+    return None if least is None else least / 1e9
 
 
 def _parts(rows: DecodedRows, type_name: str) -> Parts:

@@ -26,6 +26,7 @@ from edslam_ti.event_files.text import TextRows
 from edslam_ti.events import Events
 
 IN_MEMORY = 2_000_000  # rows; smaller arrays are checked each time, which takes a quarter of a second
+MOST_IN_MEMORY = 100_000_000  # events, 1.3 GB; longer files without room for a copy are refused
 SLOW = 50_000_000  # bytes; longer files show a bar while they are checked
 
 logger = logging.getLogger(__name__)
@@ -186,9 +187,14 @@ def _checked(
                 if stored.has_room(most):
                     summary = stored.write(shown(update), summarised)
                     return MappedEvents(stored.folder, size), summary
-                reason = f"expected room for {most * BYTES_PER_EVENT / 1e9:.1f} GB"
+                reason = f"no room for {most * BYTES_PER_EVENT / 1e9:.1f} GB"
             except OSError as error:
                 reason = str(error.strerror or error)
+            if most > MOST_IN_MEMORY and not isinstance(source, NpyRows):
+                raise DataError(
+                    f"{source.name}: expected to store its events in {stored.folder.parent} once, got "
+                    f"{reason}; EDSLAM_CACHE=FOLDER stores them elsewhere"
+                )
             logger.warning(
                 "%s: no copy of its events in %s (%s); they are checked again each time",
                 *(source.path, stored.folder.parent, reason),

@@ -83,6 +83,10 @@ class VectorDecoder:
         """`has_time`: stamps begin at 0, else the events before the first stamp are left out."""
         self._codes = codes
         self.num_unknown = 0  # words of no known type
+        events = [codes.single, codes.vector_8, codes.vector_12]
+        known = [*events, codes.line, codes.base, codes.time_low, codes.time_high, *codes.others]
+        self._is_event = np.isin(np.arange(16), events)  # by type
+        self._is_unknown = ~np.isin(np.arange(16), known)
         self._has_time = has_time
         self._line, self._low, self._high = Latest(0), Latest(0), Latest(0)
         self._base, self._polarity = Latest(0), Latest(0)
@@ -92,10 +96,9 @@ class VectorDecoder:
     def __call__(self, words: np.ndarray) -> RawEvents:  # [N] uint16
         """Return the events of the next words, in their order; t in microseconds since the clock's zero."""
         codes = self._codes
-        kind = words >> 12
-        self.num_unknown += int(np.isin(kind, self._unknown()).sum())
-        is_event = (kind == codes.single) | (kind == codes.vector_8) | (kind == codes.vector_12)
-        at = np.flatnonzero(is_event)
+        kind = (words >> 12).astype(np.uint8)
+        self.num_unknown += int(self._is_unknown[kind].sum())
+        at = np.flatnonzero(self._is_event[kind])
         stamps, at = self._stamps(words, kind, at)
         word, kind_at = words[at], kind[at]
 
@@ -105,9 +108,16 @@ class VectorDecoder:
         start, polarity = self._vector_starts(words, kind, at)
         start = np.where(is_single, word & 0x7FF, start)
         polarity = np.where(is_single, (word >> 11) & 1, polarity)
-        mask = np.where(is_single, 1, np.where(kind_at == codes.vector_8, word & 0xFF, word & 0xFFF))
-        bits = np.unpackbits(mask.astype("<u2").view(np.uint8).reshape(-1, 2), axis=1, bitorder="little")
-        which, pixel = np.nonzero(bits)
+        mask = np.where(kind_at == codes.vector_8, word & 0xFF, word & 0xFFF)
+        vectors = np.flatnonzero(~is_single)
+        if len(vectors) == 0:
+            return RawEvents(start, line, stamps, polarity)
+        bits = np.unpackbits(mask[vectors].view(np.uint8).reshape(-1, 2), axis=1, bitorder="little")
+        number = np.ones(len(at), np.int64)  # of events in each word
+        number[vectors] = bits.sum(1)
+        which = np.repeat(np.arange(len(at)), number)
+        pixel = np.zeros(len(which), np.int64)
+        pixel[~is_single[which]] = np.nonzero(bits)[1]
         return RawEvents(start[which] + pixel, line[which], stamps[which], polarity[which])
 
     def _stamps(
@@ -145,11 +155,6 @@ class VectorDecoder:
         if len(words):
             self._base.moved(int(passed[-1] + length[-1]))
         return start, self._polarity(place, (words[place] >> 11) & 1, at)
-
-    def _unknown(self) -> list[int]:
-        codes = self._codes
-        known = {codes.line, codes.single, codes.base, codes.vector_8, codes.vector_12}
-        return sorted(set(range(16)) - known - {codes.time_low, codes.time_high, *codes.others})
 
 
 class Evt2Decoder:

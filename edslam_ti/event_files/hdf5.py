@@ -12,24 +12,26 @@ Any group with columns x, y, t, p, any table with these fields, and any array [N
 """
 
 import contextlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from edslam_ti.errors import DataError, MissingExtraError, plain
+from edslam_ti.errors import DataError, EdSlamError, MissingExtraError, plain
 from edslam_ti.event_files import ecf
 from edslam_ti.event_files.checks import LARGEST_SIZE, detected_order
 from edslam_ti.event_files.choice import chosen
 from edslam_ti.event_files.ecf import EcfDataset
 from edslam_ti.event_files.rows import PROBE_LENGTH, PROBES, named_columns
-from edslam_ti.event_files.stream import Clock, RawEvents
+from edslam_ti.event_files.stream import INSTALL, Clock, RawEvents
 from edslam_ti.event_files.units import clock_of
 
 INDEX_NAMES = ("ms_to_idx", "ms_map_idx")  # k-th entry: first event at or after k milliseconds
 CACHE = 16_000_000  # bytes of decompressed chunks that are kept for each dataset
+LARGEST_CACHE = 64_000_000  # where a single chunk is longer
 INDEX_SLACK = 1000  # us; an entry further off means that the index belongs to other events
-INSTALL = "pip install 'edslam-ti[formats]'"
 
 
 class Hdf5Columns:
@@ -38,8 +40,13 @@ class Hdf5Columns:
     def __init__(self, path: Path, size: tuple[int, int] | None, group: str | None) -> None:
         """`size` is the image's, if known; `group` names a camera, such as "left" or "prophesee/right"."""
         self.path = path
-        file = _opened(path)
-        tables = _tables(file)
+        self.notes: list[str] = []
+        with _one_line(path):
+            self._open(size, group)
+
+    def _open(self, size: tuple[int, int] | None, group: str | None) -> None:
+        path = self.path
+        file, tables = _opened(path)
         if not tables:
             raise DataError(
                 f"{path}: expected events x, y, t, p (a group of four columns, a table with these fields, or "
@@ -196,13 +203,29 @@ def _h5py() -> Any:
     return h5py
 
 
-def _opened(path: Path) -> Any:
+def _opened(path: Path) -> tuple[Any, dict[str, "_Table"]]:
+    """Return an open file and its tables; decompressed chunks of a slice are kept if they can be."""
+    file = _h5py().File(path, "r", rdcc_nbytes=CACHE)
+    tables = _tables(file)
+    datasets = [dataset for table in tables.values() for dataset in table.datasets]
+    largest = max((int(np.prod(d.chunks)) * d.dtype.itemsize for d in datasets if d.chunks), default=0)
+    if largest > CACHE:
+        file.close()
+        file = _h5py().File(path, "r", rdcc_nbytes=min(largest, LARGEST_CACHE))
+        tables = _tables(file)
+    return file, tables
+
+
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """Turn what h5py raises for a damaged file into one line."""
     try:
-        return _h5py().File(path, "r", rdcc_nbytes=CACHE)
-    except OSError as error:
-        raise DataError(
-            f"{path}: not readable as HDF5 ({plain(error)}); copy or download it again"
-        ) from error
+        yield
+    except EdSlamError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        problem = f"not readable as HDF5 ({plain(error)}); copy or download it again"
+        raise DataError(f"{path}: {problem}") from error
 
 
 def _tables(file: Any) -> dict[str, _Table]:

@@ -1,5 +1,6 @@
 """Events as a folder of arrays x.npy, y.npy, t.npy, p.npy."""
 
+import tokenize
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,10 @@ class _Column:
             values = np.load(path, mmap_mode="r", allow_pickle=False)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{path} not found; expected x.npy, y.npy, t.npy and p.npy") from error
-        except (OSError, ValueError, EOFError, SyntaxError, TypeError) as error:
+        except (
+            *(OSError, ValueError, EOFError, SyntaxError, TypeError, tokenize.TokenError),
+            *(RecursionError, MemoryError, OverflowError),
+        ) as error:
             raise DataError(
                 f"{path}: not readable as a NumPy .npy file ({plain(error)}); copy or download it again"
             ) from error

@@ -3,6 +3,7 @@
 Members are decompressed piece by piece.
 """
 
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -147,7 +148,7 @@ def _one_line(path: Path) -> Iterator[None]:
         raise
     except (
         *(zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, SyntaxError, TypeError),
-        *(NotImplementedError, RuntimeError),
+        *(NotImplementedError, RuntimeError, MemoryError, OverflowError, tokenize.TokenError),
     ) as error:
         raise DataError(
             f"{path}: not readable as a NumPy .npz archive ({plain(error)}); copy or download it again"

@@ -130,7 +130,7 @@ class _ColumnRows:
 
 
 class _Blocks:
-    """Blocks of `BLOCK` events, checked; the last few are kept."""
+    """Blocks of `BLOCK` events, checked and each sorted by time (stable); the last few are kept."""
 
     def __init__(self, columns: EventColumns, size: tuple[int, int]) -> None:
         self._columns = columns
@@ -165,9 +165,19 @@ class _Blocks:
         if last < self._number and self._start(last)[1] < end:
             last += 1
         for k in range(first, last):
-            part = self._block(k)
+            part = self._cut(self._block(k), start, end)
             if len(part):
                 yield part
+
+    def _cut(self, block: RawEvents, start: float, end: float) -> RawEvents:
+        """Return the part of a block in which events with start <= t < end (s) are, or a little more."""
+        bounds = []
+        for seconds, sign in ((start, -1), (end, 1)):
+            number = self._columns.clock.number(seconds)
+            number += sign * (4 * np.spacing(abs(number)) + (0 if block.t.dtype.kind == "f" else 2))
+            bounds.append(_as_type(number, block.t.dtype))
+        i, j = (int(np.searchsorted(block.t, bound)) for bound in bounds)
+        return RawEvents(block.x[i:j], block.y[i:j], block.t[i:j], block.p[i:j])
 
     def _first_from(self, seconds: float) -> int:
         """Return the first block that begins at a time or later; the number of blocks: none does."""
@@ -245,7 +255,11 @@ class _Blocks:
 
     def _converted(self, raw: RawEvents) -> RawEvents:
         p = (raw.p == 1).view(np.int8) * np.int8(2) - np.int8(1)
-        return RawEvents(raw.x.astype(np.int16, copy=False), raw.y.astype(np.int16, copy=False), raw.t, p)
+        x, y, t = raw.x.astype(np.int16, copy=False), raw.y.astype(np.int16, copy=False), raw.t
+        if not (t[1:] >= t[:-1]).all():
+            order = np.argsort(t, kind="stable")
+            x, y, t, p = x[order], y[order], t[order], p[order]
+        return RawEvents(x, y, t, p)
 
     def _checked(self, k: int) -> tuple[np.ndarray, BadRows]:  # [N] bool
         """Return which events of a block are good, judged with the events around it, and the bad ones."""
@@ -271,3 +285,11 @@ def _are_pixels(values: np.ndarray, end: int) -> bool:  # [N]
     if values.dtype.kind == "f" and not (values == np.rint(values)).all():
         return False
     return bool(values.max() < end and (values.dtype.kind == "u" or values.min() >= 0))
+
+
+def _as_type(number: float, dtype: np.dtype) -> np.generic:
+    """Return a number as a type, as near as the type comes to it."""
+    if dtype.kind == "f":
+        return dtype.type(number)
+    info = np.iinfo(dtype)
+    return dtype.type(int(min(max(number, info.min), info.max)))

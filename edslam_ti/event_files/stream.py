@@ -9,6 +9,8 @@ import numpy as np
 
 from edslam_ti.events import Events
 
+INSTALL = "pip install 'edslam-ti[formats]'"  # the packages that some formats need
+
 Progress = Callable[[float], None]  # receives the share done, 0 to 1
 
 
@@ -79,6 +81,10 @@ class Clock:
         else:
             seconds = (numbers.astype(np.int64) + (self.offset - whole)) / np.float64(self.ticks)
         return seconds - rest if abs(rest) > 1e-12 * abs(shift) else seconds
+
+    def number(self, seconds: float) -> float:
+        """Return about which number stands for a time."""
+        return seconds * self.ticks - self.offset
 
 
 class EventColumns(Protocol):

@@ -16,6 +16,15 @@ from edslam_ti.trajectory import Trajectory, read_tum
 MOST_LOST = 0.1  # of the frames; beyond, a run's exit code says that its path is not to be trusted
 
 
+READ_METRICS: dict[str, tuple[type, ...]] = {  # what is shown of metrics.json
+    "scene": (str,),
+    "method": (str,),
+    "ate_rmse_cm": (float, int),
+    "num_lost_frames": (int,),
+    "num_frames": (int,),
+}
+
+
 @dataclass(frozen=True)
 class Result:
     """What can be shown of a results folder; parts a run did not make are None."""
@@ -31,7 +40,7 @@ class Result:
     @property
     def title(self) -> str:
         """Scene, method and ATE, as far as metrics.json tells, else the folder's name."""
-        words = [str(self.metrics[key]) for key in ("scene", "method") if self.metrics.get(key)]
+        words = [plain(self.metrics[key], 80) for key in ("scene", "method") if self.metrics.get(key)]
         ate = self.metrics.get("ate_rmse_cm")
         name = " ".join(words) or self.folder.name
         name += " (unfinished)" if is_unfinished(self.folder) else ""
@@ -72,7 +81,7 @@ def load_result(folder: Path) -> Result:
 def require_tracked(folder: Path) -> None:
     """Raise `LostTrackError` where more than a tenth of a run's frames was lost."""
     metrics = _read_metrics(folder)
-    lost, frames = metrics.get("num_lost_frames", 0), metrics.get("num_frames", 0)
+    lost, frames = metrics.get("num_lost_frames") or 0, metrics.get("num_frames") or 0
     if lost > MOST_LOST * frames:
         raise LostTrackError(
             f"{lost} of {frames} frames were lost; log.txt says why. What there is has been saved to {folder}"
@@ -87,4 +96,7 @@ def _read_metrics(folder: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not readable as JSON ({plain(error)})") from error
     if not isinstance(metrics, dict):
         raise DataError(f"{path}: expected an object of metrics, got {plain(metrics, 60)}")
+    for name, kinds in READ_METRICS.items():
+        if not isinstance(metrics.get(name), (*kinds, type(None))):
+            raise DataError(f"{path}: {name}: expected {kinds[0].__name__}, got {plain(metrics[name], 60)}")
     return metrics

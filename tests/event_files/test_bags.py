@@ -12,7 +12,7 @@ from event_files.written_prophesee import Event, evt3_words, some_events
 
 from edslam_ti.errors import DataError, MissingExtraError
 from edslam_ti.event_files import EventStream, open_events
-from edslam_ti.event_files.bags import bag_images, bag_imu, bag_topics
+from edslam_ti.event_files.bags import bag_images, bag_imu, bag_topics, sensor_clock_zero
 from edslam_ti.events import Events
 
 SIZE = (1280, 720)
@@ -76,10 +76,14 @@ def test_evt3_packets_go_on(tmp_path: Path, kind: str) -> None:
     with BagWriter(tmp_path / "a", kind) as bag:
         for k in range(0, len(words), 333):
             part = words[k : k + 333]
-            bag.packet("/e", "evt3", struct.pack(f"<{len(part)}H", *part), SIZE, stamp=START + k)
+            # Messages arrive some 20 ms late, the first one after 1 ms.
+            stamp = START + 60_000_000 * k // len(words) + (20_000_000 if k else 1_000_000)
+            bag.packet("/e", "evt3", struct.pack(f"<{len(part)}H", *part), SIZE, stamp=stamp)
     stream = open_events(bag.path)
     assert_holds(stream, events)
     assert "the sensor's own; its zero is about 1700000000.1" in stream.notes[0]
+    zero = sensor_clock_zero(bag.path)
+    assert zero == pytest.approx((START + 1_000_000 - 1000 * events[0].t) / 1e9, abs=1e-6)
 
 
 def test_libcaer_packets(tmp_path: Path) -> None:

@@ -190,6 +190,12 @@ def test_the_front_end_is_timed_in_a_cache_of_its_own(
     monkeypatch.setattr("edslam_ti.experiments.front_end.IN_MEMORY", 10_000)
     monkeypatch.setattr("edslam_ti.event_files.checked.IN_MEMORY", 10_000)
     rows = list(front_end((64, 48), 5_000, Stopwatch(1)))
-    assert [row.task.split(": ")[1] for row in rows] == ["check and copy", "read, count, time surface"]
+    steps = [row.task.split(": ")[1] for row in rows]
+    assert steps == [
+        "check and copy",
+        *["read, count, time surface", "open"] * 2,
+        "read, count, time surface",
+    ]
+    assert [word in row.task for word, row in zip(("npy columns", "HDF5"), rows[2::2])] == [True, True]
     assert all(row.wall_ms > 0 for row in rows)
     assert not list(tmp_path.iterdir())

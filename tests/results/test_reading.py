@@ -34,7 +34,13 @@ def test_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
         *[(name, b"garbage") for name in ("points.ply", "mesh.ply", "metrics.json")],
         *[
             ("metrics.json", damage)
-            for damage in (b"[" * 100_000, b"[1]", b"\xff", b'{"a": ' + b"9" * 9999 + b"}")
+            for damage in (
+                b"[" * 100_000,
+                b"[1]",
+                b'{"ate_rmse_cm": [1]}',
+                b"\xff",
+                b'{"a": ' + b"9" * 9999 + b"}",
+            )
         ],
     ],
 )
