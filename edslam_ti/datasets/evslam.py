@@ -31,7 +31,7 @@ from edslam_ti.trajectory import read_tum
 
 EVENTS, IMU = "/dvxplorer_left/events", "/dvxplorer_left/imu"
 INFRARED = "/camera/infra1/"  # depth is computed in this camera's frame
-CALIBRATION = ("*calib_results_cam*.txt", "*calib_results_cam*.yaml", "*camchain*.yaml")
+CALIBRATION = ("*calib_results_cam*.txt", "*calib_results_cam*.yaml")
 MILLIMETRES = DepthFormat(0.001)
 
 

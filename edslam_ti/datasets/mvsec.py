@@ -28,6 +28,29 @@ from edslam_ti.geometry import orthonormalized
 from edslam_ti.lenses import Undistortion
 from edslam_ti.trajectory import in_order as poses_in_order
 
+# Published for the indoor flights (camchain-imucam-indoor_flying.yaml), used where the file is absent.
+INDOOR_FLYING: dict[str, Any] = {
+    "intrinsics": [226.38018519795807, 226.15002947047415, 173.6470807871759, 133.73271487507847],
+    "distortion_model": "equidistant",
+    "distortion_coeffs": [
+        -0.048031442223833355,
+        0.011330957517194437,
+        -0.055378166304281135,
+        0.021500973881459395,
+    ],
+    "resolution": [346, 260],
+    "projection_matrix": [
+        [199.6530123165822, 0.0, 177.43276376280926, 0.0],
+        [0.0, 199.6530123165822, 126.81215684365904, 0.0],
+        [0.0, 0.0, 1.0, 0.0],
+    ],
+    "rectification_matrix": [
+        [0.999877311526236, 0.015019439766575743, -0.004447282784398257],
+        [-0.014996983873604017, 0.9998748347535599, 0.005040367172759556],
+        [0.004522429630305261, -0.004973052949604937, 0.9999774079320989],
+    ],
+}
+
 EVENT_FILES = "*_data.hdf5"
 LEFT = "davis/left"
 GRAVITY = 9.81  # m/s^2
@@ -44,18 +67,18 @@ class MvsecSequence(Recording):
         event_file = only_file(folder, EVENT_FILES, "events")
         name = event_file.name.removesuffix("_data.hdf5")
         path = _calibration_file(folder, name)
-        values = read_yaml(path)
-        if not isinstance(values, dict) or not isinstance(values.get("cam0"), dict):
-            raise DataError(f"{path}: expected a Kalibr camchain with cam0")
-        lens = kalibr_lens(values["cam0"], f"{path}: cam0")
+        cam0 = INDOOR_FLYING if path is None else _cam0(path)
+        lens = kalibr_lens(cam0, f"{path}: cam0")
         truth_file = folder / f"{name}_gt.hdf5"
         truth = Hdf5File(truth_file) if truth_file.is_file() else None
-        rectified = _rectified(values["cam0"], lens.pinhole, path)
+        rectified = _rectified(cam0, lens.pinhole, path)
         if truth is None or f"{LEFT}/depth_image_rect" not in truth:
             rectified = None
         camera, R = rectified or (lens.best_fit, np.eye(3))
         events = open_events(event_file, (camera.width, camera.height), group="left")
         super().__init__(folder, events, Undistortion(lens, camera, R), "MVSEC")
+        if path is None:
+            self.description += "; published calibration of the indoor flights, because no file states it"
         data = Hdf5File(event_file)
         if f"{LEFT}/image_raw" in data:
             times = data.times(f"{LEFT}/image_raw_ts", 1.0)
@@ -107,7 +130,14 @@ class MvsecSequence(Recording):
             self.set_truth(path, "pose_ts", T_camera_rectified)
 
 
-def _rectified(values: dict[str, Any], sensor: Camera, path: Path) -> tuple[Camera, np.ndarray] | None:
+def _cam0(path: Path) -> dict[str, Any]:
+    values = read_yaml(path)
+    if not isinstance(values, dict) or not isinstance(values.get("cam0"), dict):
+        raise DataError(f"{path}: expected a Kalibr camchain with cam0")
+    return dict(values["cam0"])
+
+
+def _rectified(values: dict[str, Any], sensor: Camera, path: Path | None) -> tuple[Camera, np.ndarray] | None:
     """Return the rectified camera and the rotation to it, None where the file does not state them."""
     if "projection_matrix" not in values:
         return None
@@ -124,14 +154,19 @@ def _rectified(values: dict[str, Any], sensor: Camera, path: Path) -> tuple[Came
         raise DataError(f"{path}: projection_matrix: {error}") from error
 
 
-def _calibration_file(folder: Path, name: str) -> Path:
-    """Return the camchain of a recording; of several, that of its scenario, as indoor_flying of 1 to 4."""
+def _calibration_file(folder: Path, name: str) -> Path | None:
+    """Return the camchain of a recording; of several, that of its scenario, as indoor_flying of 1 to 4.
+
+    Without a file it is None for the indoor flights, whose calibration is known.
+    """
     scenario = name.rstrip("0123456789")
     for parent in (folder, folder.resolve().parent):
         found = sorted([*parent.glob("camchain*.yaml"), *parent.glob("*calib/camchain*.yaml")])
         matching = [p for p in found if scenario in p.name] or found
         if matching:
             return matching[0]
+    if scenario == "indoor_flying":
+        return None
     raise FileNotFoundError(
         f"{folder}: calibration not found; expected {scenario}_calib/camchain-imucam-{scenario}.yaml, "
         "here or one folder up"

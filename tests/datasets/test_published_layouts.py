@@ -361,6 +361,18 @@ def test_bad_files_are_refused_in_one_line(
     assert str(caught.value).isprintable()
 
 
+def test_indoor_flights_have_a_published_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "W", 346)
+    monkeypatch.setitem(globals(), "H", 260)
+    monkeypatch.setitem(globals(), "SENSOR", Camera(346, 260, 226.38, 226.15, 173.647, 133.733))
+    tree = write_mvsec(tmp_path / "data/mvsec")
+    shutil.rmtree(tree.folder / "indoor_flying_calib")
+    sequence = opened(tree)
+    assert sequence.camera.shape == (260, 346)
+    assert sequence.camera.fx == pytest.approx(199.65301)
+    assert "published calibration" in sequence.description
+
+
 def test_missing_depth_is_said_with_what_can_be_done(tmp_path: Path) -> None:
     tree = write_dsec(tmp_path / "data/dsec")
     shutil.rmtree(tree.folder / "disparity")
