@@ -13,7 +13,7 @@ import types
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -172,8 +172,14 @@ def _take(kind: Any, words: list[str]) -> list[str]:
     return taken
 
 
+def _bare(kind: Any) -> Any:
+    """Return T of `Annotated[T, ...]`; the bounds in it are pydantic's to check."""
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
 def _num_words(kind: Any) -> int | None:
     """Return how many words a value of this type takes, None for any number."""
+    kind = _bare(kind)
     if get_origin(kind) in (Union, types.UnionType):
         return _num_words(_without_none(kind))
     if get_origin(kind) is not tuple:
@@ -191,6 +197,7 @@ def _read(option: Option, words: list[str]) -> Any:
 
 
 def _value(kind: Any, words: list[str]) -> Any:
+    kind = _bare(kind)
     origin, items = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return None if words == ["None"] else _value(_without_none(kind), words)
@@ -313,6 +320,7 @@ def _shown_value(value: Any) -> str:
 
 
 def _metavar(kind: Any) -> str:
+    kind = _bare(kind)
     origin, items = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return "{None}|" + _metavar(_without_none(kind))

@@ -362,6 +362,8 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
     """Return one line on the first problem; an unknown key comes with its nearest valid name."""
     problem = error.errors()[0]
     name = ".".join(str(part) for part in problem["loc"])
+    if not name:  # of several fields together
+        return str(problem["msg"]).removeprefix("Value error, ")
     if problem["type"] != "extra_forbidden":
         return f"{name}: {problem['msg']}, got {shown(problem['input'])}"
     stage: Any = model

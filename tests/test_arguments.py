@@ -1,13 +1,18 @@
 """Words on the command line become values by the type of the field they are for."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import AliasChoices, Field
 
-from edslam_ti.arguments import Shown, UsageError, read_options
-from edslam_ti.config import Stage, merged, with_present_names
+from edslam_ti.arguments import Shown, UsageError, options_of, read_given, read_options
+from edslam_ti.commands.benchmark import BenchmarkOptions
+from edslam_ti.commands.evaluate import EvaluateOptions
+from edslam_ti.commands.simulate import SimulateOptions
+from edslam_ti.commands.view import ViewOptions
+from edslam_ti.config import Config, Stage, merged, with_present_names
 from edslam_ti.errors import ConfigError
 
 
@@ -29,6 +34,8 @@ class Everything(Stage):
     """Choices."""
     point: tuple[float, float, float] | None = None
     """Three numbers."""
+    gap: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(le=9)]] | None = None
+    """Two numbers with bounds of their own."""
     sizes: tuple[tuple[int, int], ...] = ((1, 2),)
     """Pairs."""
     seeds: tuple[int, ...] = (0,)
@@ -48,6 +55,7 @@ def read(line: str) -> Everything:
         ("--up -x", "up", "-x"),
         ("--point -1 -1e-3 2", "point", (-1.0, -0.001, 2.0)),
         ("--point None", "point", None),
+        ("--gap 0.1 2", "gap", (0.1, 2.0)),
         ("--sizes 320 240 640 480", "sizes", ((320, 240), (640, 480))),
         ("--seeds", "seeds", ()),
         ("--seeds 1 --seeds 2 3", "seeds", (2, 3)),  # the last one counts
@@ -115,3 +123,12 @@ def test_help_shows_defaults_and_required_options(capsys: pytest.CaptureFixture[
         "inner: A stage. --inner.speed FLOAT Metres per second. (default: 1.0)",
     ):
         assert text in shown
+
+
+@pytest.mark.parametrize("model", [Config, SimulateOptions, ViewOptions, EvaluateOptions, BenchmarkOptions])
+def test_every_option_of_every_command_takes_a_word(model: type[Stage]) -> None:
+    for option in options_of(model):
+        words = [str(word) for word in ("0.5", "1", "2") for _ in range(2)]
+        for count in (1, 2, 3):
+            with contextlib.suppress(UsageError):  # a wrong number of words, or a value out of bounds
+                read_given(model, [option.flags[0], *words[:count]], "edslam test", None)
