@@ -80,7 +80,9 @@ ORDERS: dict[str, list[str]] = {
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
-        *("kernel_times", "front_end", "steps", "benchmark", "command"),
+        *("kernel_times", "front_end", "steps", "benchmark"),
+        *("jobs", "scheduler", "published", "paper_options", "paper_plan", "table_text", "paper_tables"),
+        *("paper_views", "paper_figures", "html_report", "paper", "command"),
     ],
 }
 
@@ -89,7 +91,15 @@ LIBRARIES: dict[str, list[str]] = {
     "taichi": ["kernels.engine", "kernels.taichi_speedups"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
-    "pydantic": ["config", "arguments", "checkpoint", "command_line", "simulation", "datasets"],
+    "pydantic": [
+        "experiments.paper_options",
+        "config",
+        "arguments",
+        "checkpoint",
+        "command_line",
+        "simulation",
+        "datasets",
+    ],
     "yaml": ["config"],
     "scipy": ["trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"],
     "cv2": [
@@ -116,6 +126,7 @@ LIBRARIES: dict[str, list[str]] = {
     "matplotlib": ["results"],
     "rich": ["patient_console", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
+    "ray": ["experiments.scheduler"],
 }
 USES_OPEN3D = [
     "mesh_reading",
@@ -130,7 +141,7 @@ USES_OPEN3D = [
     *("baselines", "results", "viewer"),
 ]
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
-HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
+HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py", "ray"}
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more
 
