@@ -102,7 +102,7 @@ def _group(group: ShownGroup) -> dict[str, Any]:
     return {
         "scene": group.scene,
         "data": group.data,
-        "kind": ", ".join(group.data.split(", ")[1:2]) or group.data,
+        "kind": group.kind,
         "truth": None if truth is None else in_plane(truth.poses[_thinned(len(truth)), :3, 3]),
         "runs": [_run(run, in_plane) for run in group.runs],
         "views": views,

@@ -264,7 +264,8 @@ def child(job_text: str, folder_text: str, at_once: str) -> None:
 
 
 def _end_with_parent() -> None:
-    sys.stdin.buffer.read()  # until the parent closes it or dies
+    while os.read(0, 1):  # until the parent closes it or dies; sys.stdin would be locked at exit
+        pass
     os._exit(1)
 
 
@@ -278,4 +279,4 @@ def outcome_of(job: Job, folder: Path, code: int) -> Outcome:
         lines = (folder / OUTPUT).read_text(errors="replace").strip().splitlines() or [""]
     how = f"signal {-code}" + (" (out of memory?)" if code == -9 else "") if code < 0 else f"exit code {code}"
     message = textwrap.shorten(f"the process ended with {how}; {lines[-1]}", LONGEST_MESSAGE)
-    return {**about(job), "error": message.removesuffix("; ")}
+    return {**about(job), "error": message.removesuffix(";")}

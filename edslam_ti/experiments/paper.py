@@ -16,6 +16,7 @@ from edslam_ti.experiments.jobs import Job, Outcome
 from edslam_ti.experiments.paper_figures import write_figures
 from edslam_ti.experiments.paper_options import PaperOptions
 from edslam_ti.experiments.paper_plan import ALL, COMPARISONS, Wanted, plan
+from edslam_ti.experiments.paper_store import store_tables
 from edslam_ti.experiments.paper_tables import tables_of
 from edslam_ti.experiments.paper_views import groups_of
 from edslam_ti.experiments.published import PAPER_SCENES
@@ -76,6 +77,8 @@ def write_all(
         written.append(out / f"{name}.md")
     everything = list(finished.values())
     _write(out / "results.json", json.dumps(everything, indent=1) + "\n")
+    if options.store is not None:
+        written += store_tables(options.store, tables, options)
     groups = groups_of(list(compared.values()), out)
     written += write_figures(groups, out)
     write_html(out / "report.html", tables, groups, everything, _about(everything))

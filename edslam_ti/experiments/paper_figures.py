@@ -48,7 +48,7 @@ def _draw_renders(path: Path, groups: Sequence[ShownGroup]) -> None:
             row[0].imshow(truth)
         else:
             row[0].text(0.5, 0.5, "no true image", ha="center", va="center")
-        row[0].set_ylabel(f"{group.scene}, t = {time:.2f} s\n{group.data.split(',')[1].strip()}", fontsize=7)
+        row[0].set_ylabel(f"{group.scene}, t = {time:.2f} s\n{group.kind}", fontsize=7)
         for ax, method in zip(row[1:], methods):
             view = views.get(method)
             if view is None:

@@ -41,6 +41,8 @@ class PaperOptions(Stage):
     """Weights for LPIPS, as --evaluation.lpips-weights of edslam slam."""
     fresh: bool = False
     """Repeat runs that have finished."""
+    store: Path | None = None
+    """Checkout whose docs/results also receives the tables; `edslam reproduce report` shows them in docs/."""
     threads: int = Field(2, ge=1, le=256)
     """CPU threads of each run; results depend on their number."""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -85,6 +85,12 @@ class ShownGroup:
         """The true path, None where the recording has none."""
         return next((run.truth for run in self.runs if run.truth is not None), None)
 
+    @property
+    def kind(self) -> str:
+        """What sets the group apart from others of the same scene: of a room its depth."""
+        parts = self.data.split(", ")
+        return parts[1] if self.dataset == "builtin" else self.data
+
     def plane(self) -> tuple[np.ndarray, np.ndarray]:  # [3] metres, [3, 3]
         """Return the middle of the path and its main axes, the longest first, as rows."""
         path = self.truth or self.runs[0].trajectory
