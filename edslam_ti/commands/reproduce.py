@@ -11,6 +11,7 @@ is kept too, so a run that was stopped goes on where it ended. Tables and pictur
     edslam reproduce tracking --scenes wall --seeds 0            one scene
     edslam reproduce tracking --methods ed_slam open3d_icp
     edslam reproduce ablations                                   one setting changed at a time
+    edslam reproduce long                        a minute and five through a flat of four rooms
     edslam reproduce long_stream                                 time and memory along 60 s
     edslam reproduce report                                      tables of README.md and docs/
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from edslam_ti.arguments import UsageError
 from edslam_ti.cold_start import load_kernels
 from edslam_ti.config import Stage
-from edslam_ti.experiments.paper_options import PaperOptions
+from edslam_ti.experiments.paper_options import LongOptions, PaperOptions
 from edslam_ti.experiments.selection import Selection
 
 
@@ -175,6 +175,14 @@ def everything(options: PaperOptions) -> None:
     _paper("all", options)
 
 
+def long(options: LongOptions) -> None:
+    """Walk a minute and five through a flat of four rooms, and with something that moves in view."""
+    load_kernels()
+    from edslam_ti.experiments.long_runs import reproduce_long
+
+    reproduce_long(options)
+
+
 def _paper(name: str, options: PaperOptions) -> None:
     load_kernels()
     from edslam_ti.experiments.paper import reproduce_paper
@@ -210,5 +218,6 @@ COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
     "table4": (PaperOptions, table4),
     "runtime": (PaperOptions, runtime),
     "all": (PaperOptions, everything),
+    "long": (LongOptions, long),
     "report": (ReportOptions, report),
 }

@@ -25,6 +25,7 @@ TITLES = {
     "table3": "Table III: novel views",
     "table4": "Table IV: trajectories",
     "runtime": "Runtime",
+    "long": "Long paths",
 }
 STAGES = ("tracking", "mapping", "refinement", "saving")
 

@@ -6,6 +6,7 @@ folder holds result.json once it has finished; without that it starts again.
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -36,8 +37,10 @@ RESULT, OUTPUT = "result.json", "output.txt"
 WORK = "work"  # what a run writes before it is chosen from
 KEPT = (
     *("metrics.json", "config.yaml", "log.txt", "poses.csv", "trajectory_tum.txt", "truth_tum.txt"),
+    "trajectory_frontend_tum.txt",
     "trajectory.png",
 )
+ADDED = ("path", "moving_object", "size")  # fields that were added when there were results already
 KEPT_VIEWS = 3  # pictures of held-out views
 MAPS = ("map.ply", "points.ply")  # the first that there is states the size of the map
 LONGEST_MESSAGE = 300  # characters; compilers write long messages
@@ -68,6 +71,9 @@ class Job:
     data_dir: str = "data"  # folder of the recordings
     threads: int = 2
     device: str = "cpu"
+    path: str = "hand_held"  # of a built-in recording; the following, too
+    moving_object: bool = False
+    size: tuple[int, int] | None = None  # pixels; None: 384 x 240
 
     @property
     def data(self) -> str:
@@ -75,7 +81,13 @@ class Job:
         if self.dataset == "builtin":
             noise = "exact" if self.depth == EXACT else "Kinect-like"
             length = 2.5 if self.duration is None else self.duration
-            return f"simulated room, {noise} depth {self.rate:g} Hz, {length:g} s"
+            words = ["simulated flat" if self.path == "tour" else "simulated room"]
+            words.append(f"{noise} depth {self.rate:g} Hz, {length:g} s")
+            if self.path not in ("hand_held", "tour"):
+                words.append(self.path)
+            if self.size is not None:
+                words.append("{}x{}".format(*self.size))
+            return ", ".join([*words, *(["moving object"] if self.moving_object else [])])
         length_text = "" if self.duration is None else f", first {self.duration:g} s"
         return f"recording ({self.dataset}){length_text}"
 
@@ -83,11 +95,15 @@ class Job:
     def name(self) -> str:
         """The job's folder, below the folder of all: readable, and another for every other job."""
         kind = f"{self.depth}-{self.rate:g}hz" if self.dataset == "builtin" else RECORDED
-        facts = asdict(self)
+        facts = {name: value for name, value in asdict(self).items() if self._counts(name)}
         if self.dataset == "builtin":
             del facts["data_dir"]
         digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:8]
         return f"{self.dataset}-{self.scene}-{kind}/{self.method}-seed{self.seed}-{digest}"
+
+    def _counts(self, name: str) -> bool:
+        """Return whether a field is part of the name: those added later only where they differ."""
+        return name not in ADDED or getattr(self, name) != type(self).__dataclass_fields__[name].default
 
     def settings(self, out: Path) -> Config:
         """Return the settings of the run, as the command `edslam slam` would make them."""
@@ -107,6 +123,12 @@ class Job:
         config = config.updated(dataset_differences(self.dataset))
         config = config.updated(dict(METHODS[self.method].overrides))
         return config.updated(json.loads(self.differences))
+
+
+def job_of(values: Outcome) -> Job:
+    """Return a job from its fields as JSON has them."""
+    size = values.get("size")
+    return Job(**{**values, "size": None if size is None else (int(size[0]), int(size[1]))})
 
 
 # --- one run ---
@@ -135,8 +157,23 @@ def about(job: Job) -> Outcome:
         "name": job.name,
         "data": job.data,
         "version": __version__,
+        "commit": source_commit(),
         "tracking": job.settings(Path()).tracking.model_dump(mode="json"),
     }
+
+
+@functools.cache
+def source_commit() -> str:
+    """Return the commit of the checkout that this program is; its version where it is an installed one."""
+    source = Path(edslam_ti.__file__).parents[1]
+    if not (source / ".git").exists():  # an installed package may lie in somebody else's checkout
+        return f"version {__version__}"
+    command = ["git", "-C", str(source), "rev-parse", "--short=7", "HEAD"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return f"version {__version__}"
+    return done.stdout.strip()
 
 
 def _run(job: Job, folder: Path) -> Outcome:
@@ -182,8 +219,12 @@ def _opened(job: Job, config: Config, console: Any) -> Any:
 
     if job.dataset != "builtin":
         return open_sequence(config)
-    differences = {} if job.duration is None else {"duration": job.duration}
-    settings = SimulationConfig(seed=job.seed, **differences)
+    differences: dict[str, Any] = {} if job.duration is None else {"duration": job.duration}
+    if job.size is not None:
+        differences |= {"width": job.size[0], "height": job.size[1]}
+    settings = SimulationConfig(
+        seed=job.seed, path=job.path, moving_object=job.moving_object, **differences
+    )  # fmt: skip
     with locked(cached(Path("sequences")) / f".{job.scene}.lock"):  # another job may be making it now
         made = builtin_sequence_folder(job.scene, settings, lambda share: None)
     sequence = BuiltinSequence(made)
@@ -250,7 +291,7 @@ def start(job: Job, folder: Path, at_once: int) -> "subprocess.Popen[bytes]":
 
 def child(job_text: str, folder_text: str, at_once: str) -> None:
     """Run a job in this process, which ends with its parent: that has the other end of stdin."""
-    job, folder = Job(**json.loads(job_text)), Path(folder_text)
+    job, folder = job_of(json.loads(job_text)), Path(folder_text)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with locked(folder.with_name(f".{folder.name}.lock")):
         if kept(folder) is not None:  # another process has finished it meanwhile

@@ -8,6 +8,37 @@ from pydantic import Field
 from edslam_ti.config import Stage
 
 
+class LongOptions(Stage):
+    """Walks through the flat, methods, and where they run."""
+
+    cases: tuple[str, ...] = ("minute", "five_minutes", "moving")
+    """minute, five_minutes, and moving: a minute with an object that moves in view."""
+    methods: tuple[str, ...] = ("ed_slam", "open3d_icp")
+    """Methods to compare."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of every random choice, of path and noise."""
+    depth: str = "kinect"
+    """Depth: exact or kinect."""
+    duration: float | None = Field(None, gt=0)
+    """Seconds of every case instead of its own."""
+    width: int = Field(240, ge=80)
+    """Of the images, pixels; 384 take four times as long to simulate."""
+    height: int = Field(150, ge=60)
+    """Of the images, pixels."""
+    out: Path = Path("results/long")
+    """Folder that receives long.md, long.tex, drift.png, report.html, and a folder per run."""
+    jobs: int = Field(1, ge=1, le=256)
+    """Runs side by side."""
+    ray: str | None = None
+    """Address of a Ray cluster to run on, or local to start one here; needs the extra ray."""
+    config: Path | None = None
+    """YAML file with settings that differ from every method's own."""
+    fresh: bool = False
+    """Repeat runs that have finished."""
+    threads: int = Field(2, ge=1, le=256)
+    """CPU threads of each run; results depend on their number."""
+
+
 class PaperOptions(Stage):
     """Recordings, methods, and where they run."""
 

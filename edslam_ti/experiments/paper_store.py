@@ -1,7 +1,6 @@
 """Stores finished tables in docs/results of a checkout, from where `edslam reproduce report` shows them."""
 
 import json
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ def store_tables(root: Path, tables: Sequence[Table], options: PaperOptions) -> 
     results = root / "docs" / "results"
     if not results.is_dir():
         raise DataError(f"{results}: not found; give the checkout that contains docs/ (--store)")
-    commit, words = _commit(root), command_words(options)
+    words = command_words(options)
     written, seen = [], set[str]()
     for table in tables:
         name = f"paper_{table.name}" + (f"_{table.variant}" if table.name in seen else "")
@@ -32,7 +31,7 @@ def store_tables(root: Path, tables: Sequence[Table], options: PaperOptions) -> 
         path = results / f"{name}.json"
         command = f"edslam reproduce {table.name} {words}".strip()
         with atomic_file(path) as temporary:
-            temporary.write_text(_as_json(table, command, commit))
+            temporary.write_text(_as_json(table, command))
         written.append(path)
     return written
 
@@ -49,24 +48,12 @@ def command_words(options: PaperOptions) -> str:
     return " ".join(words)
 
 
-def _commit(root: Path) -> str:
-    done = subprocess.run(
-        ["git", "-C", str(root), "rev-parse", "--short=7", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise DataError(f"{root}: expected a checkout with a commit; git says: {done.stderr.strip()}")
-    return done.stdout.strip()
-
-
-def _as_json(table: Table, command: str, commit: str) -> str:
+def _as_json(table: Table, command: str) -> str:
     columns = [c for c in table.columns if any(_is_filled(row.cells.get(c.key, EMPTY)) for row in table.rows)]
     labels = [k for k, _ in enumerate(table.labels) if any(row.labels[k] for row in table.rows)]
     heads: list[dict[str, Any]] = [{"key": f"label{k}", "title": table.labels[k]} for k in labels]
     heads += [{"key": c.key, "title": heading(c), "decimals": c.decimals} for c in columns]
-    rows = [_row(row, labels, columns, command, commit) for row in table.rows]
+    rows = [_row(row, labels, columns, command) for row in table.rows]
     lines = ",\n  ".join(json.dumps(row, ensure_ascii=False) for row in rows)
     about, notes = (json.dumps(x, ensure_ascii=False) for x in (table.title, table.notes))
     head = ",\n  ".join(json.dumps(column, ensure_ascii=False) for column in heads)
@@ -78,15 +65,13 @@ def _block(name: str, lines: str) -> str:
     return f' "{name}": [\n  {lines}\n ]'
 
 
-def _row(
-    row: Row, labels: Sequence[int], columns: Sequence[Column], command: str, commit: str
-) -> dict[str, Any]:
+def _row(row: Row, labels: Sequence[int], columns: Sequence[Column], command: str) -> dict[str, Any]:
     is_ours = bool(row.group)
     values: dict[str, Any] = {f"label{k}": row.labels[k] for k in labels}
     values |= {c.key: _value(row.cells.get(c.key, EMPTY)) for c in columns}
     return {
         "command": command if is_ours else PUBLISHED,
-        "commit": commit if is_ours else PUBLISHED,
+        "commit": row.commit if is_ours else PUBLISHED,
         "version": __version__ if is_ours else PUBLISHED,
         "source": row.labels[0],
         "values": values,

@@ -2,6 +2,7 @@
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,6 +27,7 @@ from edslam_ti.experiments.table_text import HIGH, LOW, Cell, Column, Footnotes,
 from edslam_ti.methods import METHODS
 
 OUR_METHOD = "ed_slam"
+IMAGES, PATHS = IMAGE_MEASURES, ("ate_rmse_cm",)
 OTHER_DATA = "† on other data than ours above; do not compare the digits"
 ALIGNMENTS = {FULL: "SE(3)", SLICES: "Sim(3)"}
 PATHS_OF = {
@@ -92,6 +94,7 @@ def _comparison(
         for scene in scenes
         for measure in measures
     )  # fmt: skip
+    labels = ("data", "method", "alignment")[: 3 if PATHS[0] in measures else 2]
     rows = []
     for data in _unique(o["data"] for o in outcomes):
         here = [o for o in outcomes if o["data"] == data]
@@ -108,20 +111,17 @@ def _comparison(
                     )
             has_truth = any(o.get("poses") == "truth" for o in of_method)
             label = method + (" (true poses)" if has_truth else "")
-            rows.append(Row((data, label, ALIGNMENTS[protocol]), cells, data))
+            words = (data, label, ALIGNMENTS[protocol])[: len(labels)]
+            rows.append(Row(words, cells, data, commits(of_method)))
     sources = Footnotes()
     rows += _published_rows(protocol, outcomes, scenes, measures, sources)
-    table = Table(
-        name, title, ("data", "method", "alignment"), columns, tuple(rows), variant=protocol
-    ).with_best()  # fmt: skip
+    table = Table(name, title, labels, columns, tuple(rows), variant=protocol).with_best()
     notes = [*_spread_note(outcomes), *where_others_win(table), *without_result(outcomes)]
     notes += _inputs(outcomes)
     if any("†" in label for row in rows for label in row.labels):
         notes.append(OTHER_DATA)
         notes.append("bold: the best of our runs on the same data; of published numbers, the best we know")
-    return Table(
-        name, title, table.labels, columns, table.rows, (*notes, *sources.lines()), variant=protocol
-    )  # fmt: skip
+    return replace(table, notes=(*notes, *sources.lines()))
 
 
 def _published_rows(
@@ -131,17 +131,13 @@ def _published_rows(
     measures: tuple[str, ...],
     sources: Footnotes,
 ) -> list[Row]:
-    """Return the paper's rows, then the best that is published for each scene, if that is another's."""
-    chosen = [
-        p
-        for p in PUBLISHED
-        if p.protocol == protocol and p.scene in scenes and p.measure in measures
-        if p.is_of_the_paper or p == best(protocol, p.scene, p.measure)
-    ]
+    """Return the rows of the paper, then those of others; the best of each column is bold."""
+    chosen = [p for p in PUBLISHED if p.protocol == protocol and p.scene in scenes and p.measure in measures]
     rows: dict[tuple[str, ...], dict[str, Cell]] = {}
     for p in chosen:
         mark = "" if _is_our_data(p, outcomes) else " †"
-        labels = (p.data + mark, f"{p.system} {sources.cite(p.source)}", p.alignment)
+        words = (p.data + mark, f"{p.system} {sources.cite(p.source)}", p.alignment)
+        labels = words[: 3 if PATHS[0] in measures else 2]
         tops = p == best(protocol, p.scene, p.measure)
         rows.setdefault(labels, {})[f"{p.scene} {p.measure}"] = Cell(p.value, is_best=tops)
     return [Row(labels, cells) for labels, cells in rows.items()]
@@ -191,7 +187,7 @@ def ablation(name: str, outcomes: Sequence[Outcome]) -> Table:
             if scene == ABLATION_SCENE:
                 cells |= {f"paper {m}": Cell(x) for m, x in zip(ABLATION_MEASURES, theirs[value])}
             label = f"{value} x {value}" if setting == "patch_size" else str(value)
-            rows.append(Row((data, scene, label), cells, f"{data} {scene}"))
+            rows.append(Row((data, scene, label), cells, f"{data} {scene}", commits(runs)))
     what, number = ("Patch size", "I") if setting == "patch_size" else ("Number of patches", "II")
     notes = (
         *(f"{PATHS_OF[p]}; {VIEWS_OF[p].partition(': ')[2]}" for p in groups),
@@ -231,7 +227,8 @@ def runtime(outcomes: Sequence[Outcome]) -> Table:
             at_once = max((o.get("at_once", 1) for o in good), default=1)
             beside = f"; {at_once} runs at once" if at_once > 1 else ""
             cells = {column.key: cell_of(runs, value) for column, value in RUNTIME}
-            rows.append(Row((f"{data}: {scenes}", method, device + beside), cells, data))
+            labels = (f"{data}: {scenes}", method, device + beside)
+            rows.append(Row(labels, cells, data, commits(runs)))
     sources = Footnotes()
     for speed in SPEEDS:
         cells = {
@@ -285,6 +282,11 @@ def cell_of(
         words.append(f"{len(runs) - len(good)} of {len(runs)} without result")
     spread = statistics.stdev(values) if len(values) > 1 else None
     return Cell(statistics.fmean(values), spread, ", ".join(words))
+
+
+def commits(runs: Sequence[Outcome]) -> str:
+    """Return the commits of the program that runs were made with."""
+    return ", ".join(_unique(o["commit"] for o in runs))
 
 
 def where_others_win(table: Table) -> list[str]:
@@ -345,9 +347,6 @@ def _best_of(measure: str) -> int:
 
 def _unique(values: Any) -> list[Any]:
     return list(dict.fromkeys(values))
-
-
-IMAGES, PATHS = IMAGE_MEASURES, ("ate_rmse_cm",)
 
 
 def tables_of(name: str, outcomes: Sequence[Outcome], scenes: Sequence[str]) -> list[Table]:

@@ -87,9 +87,8 @@ class ShownGroup:
 
     @property
     def kind(self) -> str:
-        """What sets the group apart from others of the same scene: of a room its depth."""
-        parts = self.data.split(", ")
-        return parts[1] if self.dataset == "builtin" else self.data
+        """What sets the group apart from others of the same scene."""
+        return self.data.partition(", ")[2] if self.dataset == "builtin" else self.data
 
     def plane(self) -> tuple[np.ndarray, np.ndarray]:  # [3] metres, [3, 3]
         """Return the middle of the path and its main axes, the longest first, as rows."""

@@ -29,11 +29,6 @@ class Published:
     alignment: str  # of the trajectory
     source: str
 
-    @property
-    def is_of_the_paper(self) -> bool:
-        """Whether the paper that this project implements states it."""
-        return self.source.startswith(PAPER)
-
 
 def dataset_of(scene: str) -> str:
     """Return the data set that the paper's scene belongs to."""
@@ -163,11 +158,6 @@ def _vector() -> list[Published]:
 PUBLISHED: tuple[Published, ...] = (*_table_4(), *_table_3(), *_inceventgs(), *_e2egs(), *_vector())
 
 LOWER_IS_BETTER = ("ate_rmse_cm", "lpips")
-
-
-def papers(protocol: str, measures: tuple[str, ...]) -> list[Published]:
-    """Return the paper's own numbers of these measures under a protocol."""
-    return [p for p in PUBLISHED if p.is_of_the_paper and p.protocol == protocol and p.measure in measures]
 
 
 def best(protocol: str, scene: str, measure: str) -> Published | None:

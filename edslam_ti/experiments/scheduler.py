@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from edslam_ti.errors import ConfigError, MissingExtraError, plain
-from edslam_ti.experiments.jobs import RESULT, Job, Outcome, kept, outcome_of, start
+from edslam_ti.experiments.jobs import RESULT, Job, Outcome, job_of, kept, outcome_of, start
 from edslam_ti.output import atomic_file
 
 Work = tuple[Job, Path]  # a job and its folder
@@ -171,7 +171,7 @@ def _check_resources(nodes: Sequence[dict[str, Any]], jobs: Sequence[Job]) -> No
 
 def _task(values: dict[str, Any], at_once: int) -> dict[str, bytes]:
     """Run a job on a worker, in a process of its own; return the files of its folder."""
-    job = Job(**values)
+    job = job_of(values)
     with tempfile.TemporaryDirectory(prefix="edslam-") as parent:
         folder = Path(parent) / job.name
         process = start(job, folder, at_once)

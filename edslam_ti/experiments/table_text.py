@@ -48,6 +48,7 @@ class Row:
     labels: tuple[str, ...]
     cells: dict[str, Cell]
     group: str = ""  # the best of each column is sought among rows of one group; "": in none of them
+    commit: str = ""  # of the program that measured it; "": others did
 
 
 @dataclass(frozen=True)

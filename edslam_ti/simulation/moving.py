@@ -1,5 +1,6 @@
 """An object that moves in view, and the renderer of a scene with it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,28 +16,23 @@ AHEAD = 2.0  # metres that the object goes ahead of the camera on a walk
 SIZE = (0.42, 0.42, 1.25)  # metres
 PERIOD = 5.0  # seconds for its way there and back, where there is no walk
 REACH = 0.72  # of the way from the middle of the free space to what the camera looks at
-PLACES_PER_SECOND = 20
+TURN_RATE = 0.4  # radians per second
 
 
 @dataclass(frozen=True)
 class MovingObject:
-    """A thing that moves through a scene, with no light of its own baked: T_world_object by time."""
+    """A thing that moves through a scene, upright and turning; no light of its own is baked."""
 
     scene: Scene  # in the object's frame, z up, its foot at the origin
-    places: np.ndarray  # [P, 3] metres, at even times of one period
-    period: float  # seconds
-    turns: float  # about itself per period
+    place: Callable[[float], np.ndarray]  # seconds -> [3] metres
+    turn_rate: float  # radians per second
 
     def pose(self, t: float) -> np.ndarray:  # [4, 4]
         """Return T_world_object at a time in seconds."""
-        u = (t / self.period) % 1.0
-        ring = np.concatenate([self.places, self.places[:1]])
-        at = u * len(self.places)
-        k = int(at)
-        angle = 2 * np.pi * self.turns * u
+        c, s = np.cos(self.turn_rate * t), np.sin(self.turn_rate * t)
         T = np.eye(4)
-        T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        T[:3, 3] = ring[k] + (at - k) * (ring[k + 1] - ring[k])
+        T[:2, :2] = [[c, -s], [s, c]]
+        T[:3, 3] = self.place(t)
         return T
 
 
@@ -46,20 +42,19 @@ def moving_object(room: Room, path: CameraPath) -> MovingObject:
     x, y, z = SIZE
     side = stretched(builder, tx.abstract(builder.rng))
     builder.box((-x / 2, -y / 2, 0.02), (x / 2, y / 2, z), side)
-    scene = builder.build("moving box")
-    if isinstance(path, TourPath):
-        count = max(2, round(path.duration * PLACES_PER_SECOND))
-        places = np.array(
-            [path.walk.at(path.walked(path.duration * k / count) + AHEAD) for k in range(count)]
-        )
-        places[:, 2] = 0
-        return MovingObject(scene, places, path.duration, turns=float(path.rounds))
     centre = (room.free_low + room.free_high) / 2
-    ends = centre + REACH * (room.sights[[0, len(room.sights) // 2]] - centre)
-    share = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(100) / 100)  # there and back, gently
-    places = ends[0] + share[:, None] * (ends[1] - ends[0])
-    places[:, 2] = 0
-    return MovingObject(scene, places, PERIOD, turns=1.0)
+    first, last = centre + REACH * (room.sights[[0, len(room.sights) // 2]] - centre)
+
+    def to_and_fro(t: float) -> np.ndarray:  # [3] metres
+        share = 0.5 - 0.5 * np.cos(2 * np.pi * t / PERIOD)
+        return np.array((*(first + share * (last - first))[:2], 0.0))
+
+    def ahead(t: float) -> np.ndarray:  # [3] metres
+        assert isinstance(path, TourPath)
+        return np.array((*path.walk.at(path.walked(t) + AHEAD)[:2], 0.0))
+
+    place = ahead if isinstance(path, TourPath) else to_and_fro
+    return MovingObject(builder.build("moving box"), place, TURN_RATE)
 
 
 class MovingRenderer:

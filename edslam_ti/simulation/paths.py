@@ -217,7 +217,10 @@ class ClosedWalk:
 
 
 class TourPath:
-    """Rounds through all rooms at walking pace, looking ahead and to both sides; ends where it began."""
+    """Rounds through all rooms at walking pace, looking ahead and to both sides; ends where it began.
+
+    A path too short for half a round goes only so far.
+    """
 
     def __init__(self, room: Room, duration: float, seed: int = 0, speed: float = 1.0) -> None:
         if room.tour is None:
@@ -228,7 +231,8 @@ class TourPath:
         rng = np.random.default_rng([seed, zlib.crc32(room.name.encode()), 2])
         self.duration = duration
         self.walk = ClosedWalk(room.tour)
-        self.rounds = max(1, round(duration * speed * TYPICAL_SPEED / self.walk.length))
+        rounds = duration * speed * TYPICAL_SPEED / self.walk.length
+        self.rounds = rounds if rounds < 0.5 else max(1, round(rounds))
         self._start = float(rng.uniform(0, self.walk.length))
         self._sways = max(1, round(duration * speed / SWAY_PERIOD))  # whole numbers, so that the path closes
         self._phase = rng.uniform(0, 2 * np.pi, 3)
@@ -238,7 +242,7 @@ class TourPath:
         return self._start + self.rounds * self.walk.length * t / self.duration
 
     def pose(self, t: float) -> np.ndarray:  # [4, 4]
-        """Return T_world_camera at a time in seconds; the same at 0 and at `duration`."""
+        """Return T_world_camera at a time in seconds; after whole rounds the same at 0 and at `duration`."""
         u = 2 * np.pi * t / self.duration
         s = self.walked(t)
         steps = round(1.8 * self.duration)

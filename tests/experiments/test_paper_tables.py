@@ -23,12 +23,13 @@ from apps import reproduce
 from edslam_ti.arguments import UsageError
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import ConfigError, DataError
-from edslam_ti.experiments import paper, scheduler
+from edslam_ti.experiments import long_runs, paper, scheduler
 from edslam_ti.experiments.documents import cell, report_tables
-from edslam_ti.experiments.jobs import RECORDED, Job, Outcome, about, execute, kept, outcome_of, start
-from edslam_ti.experiments.paper_options import PaperOptions
+from edslam_ti.experiments.jobs import RECORDED, Job, Outcome, about, execute, job_of, kept, outcome_of, start
+from edslam_ti.experiments.paper_options import LongOptions, PaperOptions
 from edslam_ti.experiments.paper_plan import TABLES, Wanted, plan
 from edslam_ti.experiments.paper_tables import tables_of
+from edslam_ti.experiments.paper_views import ShownRun
 from edslam_ti.experiments.published import FULL, PAPER_SCENES, PUBLISHED, SLICES, best
 from edslam_ti.experiments.scheduler import Work, in_processes, on_ray, resources, run_jobs
 from edslam_ti.experiments.table_text import HIGH, LOW, Cell, Column, Row, Table, as_latex, as_markdown
@@ -482,20 +483,58 @@ def test_one_page_holds_tables_paths_errors_views_and_failures(
     assert any("</script><b>broke" in line for line in data["failures"])  # shown, and it ended nothing
 
 
+def test_long_cases_are_walks_of_a_minute_and_five() -> None:
+    jobs = long_runs.plan_long(LongOptions(methods=("ed_slam",)))
+    assert [(j.duration, j.moving_object) for j in jobs] == [(60.0, False), (300.0, False), (60.0, True)]
+    assert {(j.scene, j.path, j.depth, j.size) for j in jobs} == {("flat", "tour", "kinect", (240, 150))}
+    assert len({j.name for j in jobs}) == len({j.data for j in jobs}) == 3
+    assert job_of(json.loads(json.dumps(asdict(jobs[0])))) == jobs[0]
+    with pytest.raises(ConfigError, match="cases: expected some of minute, five_minutes, moving, got 'hour'"):
+        long_runs.plan_long(LongOptions(cases=("hour",)))
+
+
+def test_fields_that_were_added_leave_the_names_of_finished_runs() -> None:
+    job = Job("builtin", "office0", "ed_slam")
+    assert job.name == "builtin-office0-exact-20hz/ed_slam-seed0-ddba9915"
+    assert replace(job, moving_object=True).name != job.name
+
+
+@pytest.mark.slow
+def test_drift_is_the_distance_from_the_truth_with_both_at_the_same_start(
+    one_by_one: tuple[Job, Path, Outcome], tmp_path: Path
+) -> None:
+    job, folder, outcome = one_by_one
+    run = ShownRun(outcome, folder)
+    curve = long_runs.drift_of(run, "trajectory_tum.txt")
+    assert curve is not None
+    travelled, drift = curve
+    assert travelled[-1] == pytest.approx(outcome["metrics"]["path_length_m"], abs=1e-3)
+    assert drift[0] == pytest.approx(0, abs=1e-9)
+    assert outcome["metrics"]["ate_rmse_cm"] / 2 < drift.max() < 20 * outcome["metrics"]["ate_rmse_cm"]
+    place = tmp_path / "runs" / job.name
+    place.parent.mkdir(parents=True)
+    place.symlink_to(folder)
+    failed = {**about(replace(job, method="open3d_icp")), "error": "it broke"}
+    long_runs.write_long([outcome, failed], tmp_path)
+    text = (tmp_path / "long.md").read_text()
+    assert f"| {drift[-1]:.2f} |" in text
+    assert "| recording (event_replica), first 0.3 s | open3d_icp | failed |" in text
+    assert (tmp_path / "drift.png").stat().st_size > 5000
+    assert (tmp_path / "report.html").is_file()
+
+
 def test_stored_tables_are_shown_by_report(tmp_path: Path) -> None:
     (tmp_path / "docs/results").mkdir(parents=True)
     options = PaperOptions(scenes=("office0",), seeds=(0, 1), store=tmp_path, out=tmp_path / "out")
     jobs = plan(Wanted(("office0",), ("ed_slam", "open3d_rgbd", "kiss_icp"), (0, 1)), ("table4",))
     outcomes = {o["name"]: o for o in RUNS}
-    with pytest.raises(DataError, match="expected a checkout"):
-        paper.write_all(("table4",), jobs, outcomes, options)
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    subprocess.run([*git[:3], "init", "-q"], check=True)
-    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "first"], check=True)
+    with pytest.raises(DataError, match="give the checkout that contains docs/"):
+        nowhere = options.model_copy(update={"store": tmp_path / "none"})
+        paper.write_all(("table4",), jobs, outcomes, nowhere)
     paper.write_all(("table4",), jobs, outcomes, options)
     stored = json.loads((tmp_path / "docs/results/paper_table4.json").read_text())
     assert stored["rows"][0]["command"] == "edslam reproduce table4 --scenes office0 --seeds 0 1"
-    assert re.fullmatch("[0-9a-f]{7}", stored["rows"][0]["commit"])
+    assert re.fullmatch("[0-9a-f]{7,}|version .*", stored["rows"][0]["commit"])
     assert stored["rows"][-1]["commit"] == "published"
     names = ("paper_table4", "paper_table4_inceventgs")
     (tmp_path / "README.md").write_text("".join(f"<!-- {n} -->\n<!-- end {n} -->\n" for n in names))
