@@ -4,6 +4,7 @@ Ten and twenty times the path of the built-in rooms: drift, loop closure and mem
 """
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from edslam_ti.results.plots import plot_drift
 from edslam_ti.trajectory import read_tum
 
 FLAT = "flat"
+VISIBLE = 0.01  # cm; a path as first tracked that differs by less from the final one is not drawn
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ COLUMNS: tuple[tuple[Column, Callable[[Outcome], float | None]], ...] = (
 
 
 def reproduce_long(options: LongOptions, console: Console | None = None) -> None:
-    """Run the methods on the cases; write long.md, long.tex, drift.png and report.html."""
+    """Run the methods on the cases; write long.md, long.tex, drift-CASE.png and report.html."""
     console = console or Console()
     jobs = plan_long(options)
     executor = in_processes(options.jobs) if options.ray is None else on_ray(options.ray)
@@ -105,27 +107,26 @@ def plan_long(options: LongOptions) -> list[Job]:
 
 
 def write_long(outcomes: Sequence[Outcome], out: Path) -> None:
-    """Write the table, the drift along the path, and the page."""
+    """Write the table, a picture of the drift along the path for each case, and the page."""
     groups = groups_of(outcomes, out)
-    curves: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     drifts: dict[str, dict[str, float]] = {}
     for group in groups:
+        curves: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for run in group.runs:
-            for name, file in (
-                ("", "trajectory_tum.txt"),
-                (" as first tracked", "trajectory_frontend_tum.txt"),
-            ):
+            for key, (file, name) in PATHS.items():
                 curve = drift_of(run, file)
-                if curve is not None:
-                    curves[f"{group.kind}: {run.method}{name}"] = curve
-                    key = "drift_first_cm" if name else "drift_cm"
-                    drifts.setdefault(run.outcome["name"], {})[key] = float(curve[1][-1])
+                if curve is None:
+                    continue
+                drifts.setdefault(run.outcome["name"], {})[key] = float(curve[1][-1])
+                final = curves.get(run.method)
+                if final is None or np.abs(curve[1] - final[1]).max() > VISIBLE:
+                    curves[run.method + name] = curve
+        if curves:
+            plot_drift(out / f"drift-{re.sub('[^0-9a-z]+', '-', group.kind.lower())}.png", curves)
     table = long_table([o | drifts.get(o["name"], {}) for o in outcomes])
     for suffix, text in ((".md", as_markdown([table])), (".tex", as_latex([table]))):
         with atomic_file(out / f"long{suffix}") as temporary:
             temporary.write_text(text, encoding="utf-8")
-    if curves:
-        plot_drift(out / "drift.png", curves)
     about = ["Walks through a simulated flat of four rooms: drift, loop closure and memory on long paths."]
     write_html(out / "report.html", [table], groups, outcomes, about)
 

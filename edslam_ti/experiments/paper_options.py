@@ -26,7 +26,7 @@ class LongOptions(Stage):
     height: int = Field(150, ge=60)
     """Of the images, pixels."""
     out: Path = Path("results/long")
-    """Folder that receives long.md, long.tex, drift.png, report.html, and a folder per run."""
+    """Folder that receives long.md, long.tex, drift-CASE.png, report.html, and a folder per run."""
     jobs: int = Field(1, ge=1, le=256)
     """Runs side by side."""
     ray: str | None = None

@@ -300,15 +300,18 @@ def where_others_win(table: Table) -> list[str]:
         ahead = []
         for column in table.columns:
             mine = ours.cells[column.key]
-            for row in rows:
-                other = row.cells[column.key]
-                if mine.value is None or other.value is None or row is ours:
-                    continue
-                if column.best * (other.value - mine.value) > 0 and other.is_best:
+            others = [row for row in rows if row is not ours and row.cells[column.key].value is not None]
+            name, shown = f"{column.group} {column.title}", partial(Cell.text, column=column)
+            if mine.value is None:  # it failed, or cannot work on this data
+                if mine.words and others:
                     ahead.append(
-                        f"{row.labels[1]} in {column.group} {column.title} "
-                        f"({other.value:.{column.decimals}f} against {mine.value:.{column.decimals}f})"
+                        f"{', '.join(row.labels[1] for row in others)} in {name} (ed_slam: {mine.words})"
                     )
+                continue
+            for row in others:
+                other = row.cells[column.key]
+                if other.is_best and not mine.is_best:
+                    ahead.append(f"{row.labels[1]} in {name} ({shown(other)} against {shown(mine)})")
         text = "; ".join(ahead) if ahead else "no other method is best in any column"
         lines.append(f"{group}: ahead of {OUR_METHOD}: {text}")
     return lines

@@ -1,6 +1,7 @@
 """Runs jobs in turn, several side by side, or on a cluster through Ray; finished ones are not repeated."""
 
 import shutil
+import socket
 import subprocess
 import tempfile
 import time
@@ -21,6 +22,7 @@ Work = tuple[Job, Path]  # a job and its folder
 Finished = tuple[Job, Outcome]
 Executor = Callable[[Sequence[Work], Callable[[str], None]], Iterator[Finished]]  # also reports what runs now
 POLL = 0.1  # seconds between looks at running processes
+ANSWER = 5.0  # seconds that a cluster may take to answer
 MEMORY = 3 * 2**30  # bytes that a run may take
 LOCAL = "local"  # address of a Ray that is started on this machine
 
@@ -124,6 +126,7 @@ def on_ray(address: str) -> Executor:
 def _on_ray(address: str, todo: Sequence[Work], report: Callable[[str], None]) -> Iterator[Finished]:
     import ray
 
+    _check_address(address)
     try:
         ray.init(address=None if address == LOCAL else address, include_dashboard=False, log_to_driver=False)
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
@@ -148,6 +151,20 @@ def _on_ray(address: str, todo: Sequence[Work], report: Callable[[str], None]) -
                 yield job, _gathered(job, folder, get)
     finally:
         ray.shutdown()
+
+
+def _check_address(address: str) -> None:
+    """Refuse an address at which nothing answers: Ray would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():  # local, auto, or what Ray knows
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"--ray {address}: nothing answers there ({error}); start a cluster with `ray start --head`, or "
+            "use --ray local"
+        ) from error
 
 
 def resources(job: Job) -> dict[str, float]:
