@@ -7,6 +7,7 @@ far are saved.
 
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +42,7 @@ from edslam_ti.truth import true_path
 from edslam_ti.viewer import VIEWERS, Viewer
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
+Opener = Callable[[Config, Console], EventDepthSequence]
 MOST_UNREADABLE = 10  # frames in a row of which something cannot be read: the recording is damaged
 
 
@@ -56,9 +58,10 @@ class _Session:
     console: Console
 
 
-def run(config: Config, console: Console | None = None) -> Path:
+def run(config: Config, console: Console | None = None, open_with: Opener | None = None) -> Path:
     """Run a method on a sequence and return the results folder.
 
+    `open_with` opens the recording in another way than by the settings' scene and data set.
     A signal (Ctrl-C, SIGTERM, SIGHUP) ends it early. What there is then, or when an exception ends it, is
     saved; then `Stopped`, which is a KeyboardInterrupt, or the exception is raised. An exception that is no
     input's fault becomes an `EdSlamError` of one line, and log.txt has its traceback.
@@ -71,7 +74,7 @@ def run(config: Config, console: Console | None = None) -> Path:
         try:
             folder.write(SETTINGS, config.to_yaml())
             folder.set_state(RUNNING)
-            viewer, state = _prepare(config, console)
+            viewer, state = _prepare(config, console, open_with or open_recording)
             folder.identity = identity_of(config)
             folder.set_state(RUNNING)
             journal = Journal(folder.path / JOURNAL, state.sequence.time_offset)
@@ -96,7 +99,7 @@ def resume(path: Path, config: Config, console: Console | None = None) -> Path:
     with signals_handled() as interruption:
         folder = RunFolder.reopen(path)
         try:
-            viewer, state = _prepare(config, console)
+            viewer, state = _prepare(config, console, open_recording)
             identity, notes = identity_of(config), list[str]()
             if folder.identity:  # else it was cut off before there was anything to depend on
                 notes += compare(folder.identity, identity, folder.path)
@@ -126,7 +129,7 @@ def _parent(config: Config) -> Path:
     return config.out / dataset / scene / config.method
 
 
-def _prepare(config: Config, console: Console) -> tuple[Viewer, Run]:
+def _prepare(config: Config, console: Console, open_with: Opener) -> tuple[Viewer, Run]:
     """Start the kernels, open the recording and all that evaluation needs; say what is missing."""
     try:
         kernels.init(config.device, threads=config.threads)
@@ -135,7 +138,7 @@ def _prepare(config: Config, console: Console) -> tuple[Viewer, Run]:
     viewer = VIEWERS["open3d" if config.visualize else "none"]()
     if config.mapping.enabled and config.evaluation.lpips_weights is not None:
         load_lpips(config.evaluation.lpips_weights)  # is it there, and what it should be?
-    sequence = open_recording(config, console)
+    sequence = open_with(config, console)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     contrast = contrast_of(config, sequence, samples)
     slam = make_slam(config, sequence, samples, contrast)

@@ -86,7 +86,9 @@ ORDERS: dict[str, list[str]] = {
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
-        *("kernel_times", "front_end", "steps", "benchmark", "command"),
+        *("kernel_times", "front_end", "steps", "benchmark"),
+        *("jobs", "scheduler", "published", "paper_options", "paper_plan", "table_text", "paper_tables"),
+        *("paper_views", "paper_figures", "html_report", "paper_store", "paper", "long_runs", "command"),
     ],
 }
 
@@ -95,7 +97,15 @@ LIBRARIES: dict[str, list[str]] = {
     "taichi": ["kernels.engine", "kernels.taichi_speedups"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
-    "pydantic": ["config", "arguments", "checkpoint", "command_line", "simulation", "datasets"],
+    "pydantic": [
+        "experiments.paper_options",
+        "config",
+        "arguments",
+        "checkpoint",
+        "command_line",
+        "simulation",
+        "datasets",
+    ],
     "yaml": ["config", "datasets"],
     "scipy": ["datasets", "trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"],
     "cv2": [
@@ -128,6 +138,7 @@ LIBRARIES: dict[str, list[str]] = {
     "aedat": ["event_files"],
     "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
+    "ray": ["experiments.scheduler"],
 }
 USES_OPEN3D = [
     "mesh_reading",
@@ -153,6 +164,7 @@ HEAVY = {
     "h5py",
     "hdf5plugin",
     "aedat",
+    "ray",
 }
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more

@@ -8,13 +8,14 @@ from edslam_ti.cache import cached
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.leftovers import remove_leftovers
 from edslam_ti.simulation import ROOM_NAMES, SimulationConfig, make_path, make_room, simulate
+from edslam_ti.simulation.moving import moving_object
 from edslam_ti.simulation.truth import write_evaluation_truth
 
 GENERATOR_VERSION = 2  # increase it when rooms, paths or rendering change, so that sequences are made again
 
 # Settings added since GENERATOR_VERSION was last increased. Their defaults change nothing, so recordings made
 # before stay valid.
-NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events")
+NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events", "moving_object")
 
 
 class BuiltinSequence(EventReplicaSequence):
@@ -51,17 +52,22 @@ def builtin_sequence_folder(
         remove_leftovers(other)  # a killed process leaves up to a gigabyte
     room = make_room(scene)
     path = make_path(room, settings)
+    moving = moving_object(room, path) if settings.moving_object else None
     if folder.is_dir():  # simulated before recordings had novel views
         write_evaluation_truth(
             folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
         )
         return folder
     if progress is not None:
-        simulate(room.scene, path, settings, folder, progress)
+        simulate(room.scene, path, settings, folder, progress, moving)
         return folder
     with Progress(transient=True) as bar:
         task = bar.add_task(f"simulating {scene} (first use)", total=1.0)
-        simulate(room.scene, path, settings, folder, lambda share: bar.update(task, completed=share))
+
+        def show(share: float) -> None:
+            bar.update(task, completed=share)
+
+        simulate(room.scene, path, settings, folder, show, moving)
     return folder
 
 

@@ -9,6 +9,7 @@ from rich.console import Console
 from edslam_ti.arguments import UsageError
 from edslam_ti.cold_start import load_kernels
 from edslam_ti.config import Stage
+from edslam_ti.experiments.paper_options import LongOptions, PaperOptions
 from edslam_ti.experiments.selection import Selection
 
 
@@ -144,6 +145,52 @@ def long_stream(options: LongStreamOptions) -> None:
     print((options.out / "long_stream.md").read_text())
 
 
+def table1(options: PaperOptions) -> None:
+    """Table I: patch size of ed_slam_paper."""
+    _paper("table1", options)
+
+
+def table2(options: PaperOptions) -> None:
+    """Table II: number of patches of ed_slam_paper."""
+    _paper("table2", options)
+
+
+def table3(options: PaperOptions) -> None:
+    """Table III: novel view synthesis, every method."""
+    _paper("table3", options)
+
+
+def table4(options: PaperOptions) -> None:
+    """Table IV: absolute trajectory error, every method."""
+    _paper("table4", options)
+
+
+def runtime(options: PaperOptions) -> None:
+    """Speed of tracking and mapping, total, memory and size of the map, every method."""
+    _paper("runtime", options)
+
+
+def everything(options: PaperOptions) -> None:
+    """All tables, figures 3 to 5, and report.html."""
+    _paper("all", options)
+
+
+def long(options: LongOptions) -> None:
+    """Walk a minute and five through a flat of four rooms, and with something that moves in view."""
+    load_kernels()
+    from edslam_ti.experiments.long_runs import reproduce_long
+
+    reproduce_long(options)
+
+
+def _paper(name: str, options: PaperOptions) -> None:
+    load_kernels()
+    from edslam_ti.experiments.paper import reproduce_paper
+    from edslam_ti.experiments.paper_plan import TABLES
+
+    reproduce_paper(TABLES if name == "all" else (name,), options)
+
+
 class ReportOptions(Stage):
     """Documents to update."""
 
@@ -165,5 +212,12 @@ COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
     "tracking": (TrackingOptions, tracking),
     "ablations": (AblationOptions, ablations),
     "long_stream": (LongStreamOptions, long_stream),
+    "table1": (PaperOptions, table1),
+    "table2": (PaperOptions, table2),
+    "table3": (PaperOptions, table3),
+    "table4": (PaperOptions, table4),
+    "runtime": (PaperOptions, runtime),
+    "all": (PaperOptions, everything),
+    "long": (LongOptions, long),
     "report": (ReportOptions, report),
 }

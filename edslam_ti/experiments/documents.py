@@ -9,7 +9,9 @@ contains the columns in order, and the rows; every row states the command and th
 
 A column of numbers states its "decimals" (with "whole_from_10": none from 10 on) or "significant" digits.
 A value is a text, a number, a list of numbers (one per seed, shown as median and range), an object {"mean",
-"worst", "lost"} over runs (shown as one number if they are equal), or null if nothing was measured.
+"worst", "lost"} over runs (shown as one number if they are equal), an object {"mean", "spread", "words",
+"is_best"} (standard deviation over seeds, or null; the best is bold), or null if nothing was measured.
+"notes" of a table stand below it.
 """
 
 import json
@@ -103,6 +105,8 @@ def table_lines(table: Mapping[str, Any]) -> list[str]:
     lines.append("|" + "|".join("--:" if is_number(column) else "---" for column in columns) + "|")
     for row in table["rows"]:
         lines.append(_line([cell(row["values"][column["key"]], column) for column in columns]))
+    if table.get("notes"):
+        lines += ["", *(f"- {note}" for note in table["notes"])]
     return lines
 
 
@@ -127,6 +131,10 @@ def cell(value: Any, column: Mapping[str, Any]) -> str:
         return value
     if isinstance(value, list):
         return f"{shown(statistics.median(value))} ({shown(min(value))} to {shown(max(value))})"
+    if isinstance(value, dict) and "spread" in value:
+        spread = "" if value["spread"] is None else f" ± {shown(value['spread'])}"
+        text = shown(value["mean"]) + spread + (f", {value['words']}" if value["words"] else "")
+        return f"**{text}**" if value["is_best"] else text
     if isinstance(value, dict):
         lost = value.get("lost")  # a number of frames, or true where the source gives none
         note = "" if not lost else ", lost frames" if lost is True else f", {lost} lost"

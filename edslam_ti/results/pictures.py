@@ -1,5 +1,6 @@
 """Pictures of rendered views without a display: comparisons with the truth, contact sheets, a fly-through."""
 
+import base64
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,24 @@ def write_contact_sheet(path: Path, rows: Sequence[PictureRow], panel_width: int
     for left, colours in ((lefts[2], cv2.COLORMAP_MAGMA), (lefts[3], cv2.COLORMAP_VIRIDIS)):
         sheet[HEAD // 2 - 4 : HEAD // 2 + 4, left : left + w // 4] = _coloured(scale, colours)
     _write_png(path, sheet)
+
+
+def read_panels(path: Path) -> tuple[np.ndarray, np.ndarray]:  # [h, w, 3] uint8 each
+    """Return truth and render of a contact sheet of one row; one without truth has only words there."""
+    sheet = cv2.imread(str(path))
+    if sheet is None:
+        raise DataError(f"{path}: expected a picture of a rendered view; it cannot be read")
+    top, w = HEAD + CAPTION, (sheet.shape[1] - GAP) // 4 - GAP
+    panels = [sheet[top:-GAP, left : left + w, ::-1] for left in (GAP, GAP + w + GAP)]
+    return panels[0], panels[1]
+
+
+def as_data_uri(picture: np.ndarray, quality: int = 85) -> str:  # [H, W, 3] uint8
+    """Return a picture as text that an HTML page can hold in place of a link, a JPEG."""
+    done, data = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, quality))
+    if not done:
+        raise DataError("picture: could not be written as JPEG")
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
 def _write_text(picture: np.ndarray, x: int, y: int, text: str) -> None:

@@ -11,6 +11,7 @@ from edslam_ti.errors import ConfigError
 from edslam_ti.output import check_replaceable
 from edslam_ti.simulation.catalogue import make_room
 from edslam_ti.simulation.mesh import load_mesh
+from edslam_ti.simulation.moving import moving_object
 from edslam_ti.simulation.paths import CameraPath, RecordedPath, look_at, make_path
 from edslam_ti.simulation.recording import RecordingSummary, simulate, why_not_a_recording
 from edslam_ti.simulation.settings import SimulationConfig
@@ -98,4 +99,9 @@ def record(
         scene = room.scene
         if trajectory is None:
             path = make_path(room, config)
-    return simulate(scene, path, config, out, progress)
+    moving = None
+    if config.moving_object:
+        if scene_name is None:
+            raise ConfigError("moving_object: expected a built-in scene, got a mesh; leave it out")
+        moving = moving_object(room, path)
+    return simulate(scene, path, config, out, progress, moving)

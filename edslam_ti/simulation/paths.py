@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.special import erf
 
 from edslam_ti.errors import DataError
@@ -23,6 +24,9 @@ BURST_INTERVAL = (1.7, 2.6)  # seconds from one burst to the next
 
 GO, STOP = 1.0, 0.6  # seconds of motion and of rest on a stop-and-go path
 FARTHEST = 1e6  # metres; float32 holds positions to 6 cm there
+LOOK_AHEAD = 1.1  # metres along a tour to the point that the camera looks at
+SWAY, SWAY_PERIOD = (32.0, 7.0), 6.5  # degrees of yaw and pitch that the gaze sways on a tour; seconds
+BOB = 0.012  # metres that a step lifts the head
 TURN_DURATION = 30.0  # seconds of a loop path for about one turn
 
 
@@ -190,8 +194,73 @@ class LoopPath:
         return _turned(look_at(position, position + forward, UP), np.array([roll, 0.0, 0.0]))
 
 
+# ---------------------------------------------------------------- through several rooms
+
+
+class ClosedWalk:
+    """A smooth closed curve through points, by the length walked."""
+
+    def __init__(self, points: np.ndarray) -> None:  # [P, 3] metres
+        ring = np.concatenate([points, points[:1]])
+        chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
+        curve = CubicSpline(chord, ring, bc_type="periodic")
+        fine = np.linspace(0, chord[-1], 200 * len(points))
+        steps = np.linalg.norm(np.diff(curve(fine), axis=0), axis=1)
+        length = np.concatenate([[0.0], np.cumsum(steps)])
+        self.length = float(length[-1])  # metres
+        self._curve = CubicSpline(length, np.concatenate([curve(fine)[:-1], ring[:1]]), bc_type="periodic")
+
+    def at(self, s: float) -> np.ndarray:  # [3] metres
+        """Return the point after `s` metres, of any number of rounds."""
+        point: np.ndarray = self._curve(s % self.length)
+        return point
+
+
+class TourPath:
+    """Rounds through all rooms at walking pace, looking ahead and to both sides; ends where it began.
+
+    A path too short for half a round goes only so far.
+    """
+
+    def __init__(self, room: Room, duration: float, seed: int = 0, speed: float = 1.0) -> None:
+        if room.tour is None:
+            raise DataError(
+                f"path 'tour' walks through several rooms: expected the scene 'flat', got '{room.name}'; "
+                "use another scene or path"
+            )
+        rng = np.random.default_rng([seed, zlib.crc32(room.name.encode()), 2])
+        self.duration = duration
+        self.walk = ClosedWalk(room.tour)
+        rounds = duration * speed * TYPICAL_SPEED / self.walk.length
+        self.rounds = rounds if rounds < 0.5 else max(1, round(rounds))
+        self._start = float(rng.uniform(0, self.walk.length))
+        self._sways = max(1, round(duration * speed / SWAY_PERIOD))  # whole numbers, so that the path closes
+        self._phase = rng.uniform(0, 2 * np.pi, 3)
+
+    def walked(self, t: float) -> float:
+        """Return the place on the walk in metres at a time in seconds."""
+        return self._start + self.rounds * self.walk.length * t / self.duration
+
+    def pose(self, t: float) -> np.ndarray:  # [4, 4]
+        """Return T_world_camera at a time in seconds; after whole rounds the same at 0 and at `duration`."""
+        u = 2 * np.pi * t / self.duration
+        s = self.walked(t)
+        steps = round(1.8 * self.duration)
+        position = self.walk.at(s) + (0, 0, BOB * np.sin(steps * u))
+        forward = self.walk.at(s + LOOK_AHEAD) - position
+        yaw = np.arctan2(forward[1], forward[0])
+        yaw += np.radians(SWAY[0]) * np.sin(self._sways * u + self._phase[0])
+        pitch = -0.06 + np.radians(SWAY[1]) * np.sin(2 * self._sways * u + self._phase[1])
+        direction = np.array(
+            (np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)), np.float64
+        )
+        return look_at(position, position + direction, UP)
+
+
 def make_path(room: Room, config: SimulationConfig) -> CameraPath:
     """Return the kind of path that the settings name."""
+    if config.path == "tour":
+        return TourPath(room, config.duration, config.seed, config.speed)
     if config.path == "loop":
         return LoopPath(room, config.duration, config.seed, config.speed)
     hand_held = HandHeldPath(room, config.duration, config.seed, config.speed)

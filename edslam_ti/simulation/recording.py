@@ -22,8 +22,9 @@ from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
 from edslam_ti.output import atomic_folder, check_replaceable, write_npy_header
 from edslam_ti.simulation.depth_noise import kinect_depth
+from edslam_ti.simulation.moving import MovingObject, MovingRenderer
 from edslam_ti.simulation.paths import CameraPath
-from edslam_ti.simulation.renderer import Render, Renderer
+from edslam_ti.simulation.renderer import Render
 from edslam_ti.simulation.scene import Scene
 from edslam_ti.simulation.settings import SimulationConfig
 from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_truth
@@ -52,12 +53,14 @@ def simulate(
     config: SimulationConfig,
     out: Path,
     progress: Callable[[float], None] | None = None,
+    moving: MovingObject | None = None,
 ) -> RecordingSummary:
     """Write the recording to the folder `out`; Taichi must have been started.
 
     `out` is a new or an empty folder, or an older simulated recording, which is replaced.
     Frames are rendered so that nothing moves more than `config.max_motion` pixels between two of them,
-    and at every image and depth time. `progress` receives the share done, 0 to 1.
+    and at every image and depth time. `moving` is an object in the scene; novel views and true surfaces are
+    without it. `progress` receives the share done, 0 to 1.
     """
     duration = min(config.duration, path.duration)
     image_times = _millisecond_times(config.image_rate, duration)
@@ -71,7 +74,7 @@ def simulate(
         )
     end = round(duration * 1e9)
     check_replaceable(out, why_not_a_recording)
-    renderer = Renderer(scene, config.camera, config.samples_per_pixel)
+    renderer = MovingRenderer(scene, moving, config.camera, config.samples_per_pixel)
     times = _FrameTimes(config, path, sorted({*image_times, *depth_times, end}))
     with atomic_folder(out, why_not_a_recording) as folder:
         for name in ("images", "depth"):
@@ -81,7 +84,7 @@ def simulate(
         images = _ImageWriter(folder / "images", image_times, config.exposure)
         depths = _DepthWriter(folder / "depth", set(depth_times), config)
         now, num_frames = 0, 1
-        render = renderer.render(path.pose(0.0))
+        render = renderer.render(path.pose(0.0), 0.0)
         log_now = _log_intensity(render, config)
         state = EventSensorState.start(log_now)
         depths.add(now, render)
@@ -89,7 +92,7 @@ def simulate(
         with EventFileWriter(file, np.float32 if config.compact_events else np.float64) as events:
             while now < end:
                 following = times.after(now, render.depth)
-                render_next = renderer.render(path.pose(following / 1e9))
+                render_next = renderer.render(path.pose(following / 1e9), following / 1e9)
                 log_next = _log_intensity(render_next, config)
                 fired = simulate_events(
                     log_now,

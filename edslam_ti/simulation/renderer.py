@@ -31,6 +31,17 @@ class Render:
         along = np.abs((self._directions * self._normals).sum(1))
         return (along / np.linalg.norm(self._directions, axis=1)).reshape(self.depth.shape)
 
+    def covered_by(self, other: "Render", T_world_other: np.ndarray) -> "Render":
+        """Return the view with another one's surfaces (in a frame of their own) where they are nearer."""
+        is_nearer = (other.depth > 0) & ((other.depth < self.depth) | (self.depth == 0))
+        chosen = is_nearer.ravel()[:, None]
+        return Render(
+            np.where(is_nearer, other.grey, self.grey),
+            np.where(is_nearer, other.depth, self.depth),
+            self._directions,
+            np.where(chosen, other._normals @ T_world_other[:3, :3].T, self._normals).astype(np.float32),
+        )
+
 
 class Renderer:
     """Ray caster of one scene and one camera."""

@@ -30,6 +30,7 @@ class Room:
     free_high: np.ndarray  # [3]
     sights: np.ndarray  # [S, 3] metres, in the order in which they are looked at
     is_closed: bool = True  # there is something to see in every direction
+    tour: np.ndarray | None = None  # [P, 3] metres, a closed walk through several rooms
 
 
 class RoomBuilder(SceneBuilder):

@@ -53,9 +53,12 @@ class SimulationConfig(Stage):
     """Rendered frames per second at least (Hz), however slow the motion."""
     speed: float = Field(1.0, ge=0.01, le=10)
     """Factor on the speed of the built-in path (1: about 0.4 m/s)."""
-    path: Literal["hand_held", "rotation", "stop_and_go", "loop"] = "hand_held"
+    path: Literal["hand_held", "rotation", "stop_and_go", "loop", "tour"] = "hand_held"
     """rotation: the camera turns on the spot; stop_and_go: it stands still for 0.6 s of every 1.6 s;
-    loop: it turns once around (every 30 s or so) and ends where it began."""
+    loop: it turns once around (every 30 s or so) and ends where it began; tour: it walks through all rooms of
+    the scene flat, again and again."""
+    moving_object: bool = False
+    """Something moves in view: a box that goes ahead on a tour, to and fro in a room."""
     pose_rate: float | None = Field(None, ge=1e-3, le=1000)
     """Written true poses per second, milliseconds as for images; omitted: one per image."""
     event_gap: Stretch | None = None

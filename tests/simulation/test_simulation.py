@@ -13,6 +13,7 @@ from edslam_ti.camera import Camera
 from edslam_ti.datasets.builtin import builtin_sequence_folder
 from edslam_ti.errors import ConfigError, DataError
 from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.ray_casting import RayCaster
 from edslam_ti.simulation import (
     ROOM_NAMES,
     SCENE_NAMES,
@@ -28,6 +29,8 @@ from edslam_ti.simulation import (
 )
 from edslam_ti.simulation.catalogue import UNSEEN_ROOM_NAMES
 from edslam_ti.simulation.depth_noise import kinect_depth
+from edslam_ti.simulation.moving import MovingRenderer, moving_object
+from edslam_ti.simulation.paths import TourPath
 from edslam_ti.simulation.renderer import Renderer
 from edslam_ti.simulation.scene import Material, SceneBuilder
 from edslam_ti.trajectory import Trajectory, read_tum
@@ -498,3 +501,46 @@ def test_real_mesh_and_real_motion(shared_data: Path, tmp_path: Path) -> None:
     depth = cv2.imread(str(tmp_path / "viking" / "depth" / "frame000100.png"), cv2.IMREAD_UNCHANGED)
     assert (depth > 0).mean() > 0.8
     assert summary.num_events > 2000
+
+
+def test_tour_goes_through_all_rooms_stays_clear_and_returns() -> None:
+    room = cached_room("flat")
+    caster = RayCaster(room.scene.vertices, room.scene.triangles)
+    path = make_path(room, SimulationConfig(path="tour", duration=60.0, seed=1))
+    assert isinstance(path, TourPath)
+    poses = np.array([path.pose(t) for t in np.arange(0, 60.01, 0.1)])
+    assert caster.distances_to(poses[:, :3, 3].astype(np.float32)).min() > 0.4  # doorways are 1.1 m wide
+    quarters = {(x > 4.3, y > 4.0) for x, y, _ in poses[:, :3, 3]}
+    assert len(quarters) == 4
+    speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / 0.1
+    assert 0.25 < speed.mean() < 0.45
+    np.testing.assert_allclose(path.pose(60.0), path.pose(0.0), atol=1e-9)
+    five = make_path(room, SimulationConfig(path="tour", duration=300.0))
+    assert isinstance(five, TourPath)
+    assert five.rounds == 7
+    short = make_path(room, SimulationConfig(path="tour", duration=2.0))
+    assert np.linalg.norm(short.pose(2.0)[:3, 3] - short.pose(0.0)[:3, 3]) < 1.0  # at walking pace, too
+    with pytest.raises(DataError, match="expected the scene 'flat', got 'office0'"):
+        make_path(cached_room("office0"), SimulationConfig(path="tour"))
+
+
+def test_a_moving_object_is_seen_where_it_is_and_hides_what_is_behind() -> None:
+    room = cached_room("office0")
+    config = SimulationConfig(width=120, height=76, duration=3.0)
+    path = make_path(room, config)
+    moving = moving_object(room, path)
+    renderer = MovingRenderer(room.scene, moving, config.camera, 2)
+    empty = Renderer(room.scene, config.camera, 2)
+    T = look_at(np.array([2.4, 1.4, 1.4]), moving.place(0.0) + (0, 0, 0.6), np.array([0.0, 0.0, 1.0]))
+    there, later, without = renderer.render(T, 0.0), renderer.render(T, 1.5), empty.render(T)
+    changed = there.depth != without.depth
+    assert 0.02 < changed.mean() < 0.6
+    assert (there.depth <= without.depth).all()
+    np.testing.assert_array_equal(there.grey[~changed], without.grey[~changed])
+    assert (changed != (later.depth != without.depth)).any()  # it has moved on
+    # What is seen of it lies on the box: within its half diagonal of where it stands.
+    v, u = np.nonzero(changed)
+    points = config.camera.back_project_pixels(u, v, there.depth[changed].astype(np.float64))
+    world = points @ T[:3, :3].T + T[:3, 3]
+    assert np.linalg.norm(world[:, :2] - moving.place(0.0)[:2], axis=1).max() < 0.31
+    assert (there.cosine[changed] > 0).any()
