@@ -73,6 +73,15 @@ def _kiss_icp(
     return KissIcpTracker(sequence.camera), TsdfMapper(sequence.camera)
 
 
+def _small_gicp(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.gicp import SmallGicpTracker
+    from edslam_ti.baselines.open3d_rgbd import TsdfMapper
+
+    return SmallGicpTracker(sequence.camera, config.small_gicp), TsdfMapper(sequence.camera)
+
+
 METHODS: dict[str, Method] = {
     "ed_slam": Method(
         "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
@@ -90,5 +99,8 @@ METHODS: dict[str, Method] = {
     ),
     "kiss_icp": Method(
         "KISS-ICP (where installed) on points of the depth images, TSDF volume; uses no events", _kiss_icp
+    ),
+    "small_gicp": Method(
+        "generalised ICP of depth (package small_gicp) to keyframes, TSDF volume; uses no events", _small_gicp
     ),
 }

@@ -15,7 +15,7 @@ RANKS: list[list[str]] = [
         *("open3d_loader", "ply_check", "mesh_reading", "cold_start", "interruption"),
         *("patient_console", "object_graph"),
     ],
-    ["config", "arguments", "geometry", "camera", "events", "tables"],
+    ["stage", "rgbd_config", "config", "arguments", "geometry", "camera", "events", "tables"],
     ["trajectory", "truth", "journal", "depth_images", "ray_casting", "alignment", "simulation"],
     ["datasets"],
     ["frame", "evaluation"],
@@ -36,7 +36,7 @@ ORDERS: dict[str, list[str]] = {
         *("errors", "memory", "leftovers", "output", "cache"),
         *("open3d_loader", "ply_check", "mesh_reading", "kernels", "cold_start", "interruption"),
         *("patient_console", "object_graph"),
-        *("config", "arguments", "geometry", "camera", "events", "tables"),
+        *("stage", "rgbd_config", "config", "arguments", "geometry", "camera", "events", "tables"),
         *(
             "trajectory",
             "truth",
@@ -89,7 +89,10 @@ LIBRARIES: dict[str, list[str]] = {
     "taichi": ["kernels.engine", "kernels.taichi_speedups"],
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
-    "pydantic": ["config", "arguments", "checkpoint", "command_line", "simulation", "datasets"],
+    "pydantic": [
+        *("stage", "rgbd_config", "config", "arguments", "checkpoint", "command_line", "simulation"),
+        "datasets",
+    ],
     "yaml": ["config"],
     "scipy": ["trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"],
     "cv2": [
@@ -110,6 +113,7 @@ LIBRARIES: dict[str, list[str]] = {
     "evo": ["evaluation"],
     "skimage": ["evaluation"],
     "kiss_icp": ["baselines"],
+    "small_gicp": ["baselines"],
     "lpips": ["evaluation"],
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
@@ -130,7 +134,7 @@ USES_OPEN3D = [
     *("baselines", "results", "viewer"),
 ]
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
-HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
+HEAVY = {"open3d", "kiss_icp", "small_gicp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more
 
