@@ -13,7 +13,7 @@ from pydantic import AliasChoices, BaseModel, Field
 from pydantic.fields import FieldInfo
 
 from edslam_ti.errors import ConfigError, EdSlamError, plain
-from edslam_ti.rgbd_config import SmallGicpConfig
+from edslam_ti.rgbd_config import SmallGicpConfig, SplatamConfig
 from edslam_ti.stage import Stage
 
 CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: settings for a data set
@@ -268,6 +268,7 @@ class Config(Stage):
     mapping: MappingConfig = MappingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     small_gicp: SmallGicpConfig = SmallGicpConfig()
+    splatam: SplatamConfig = SplatamConfig()
 
     def updated(self, differences: dict[str, Any]) -> Self:
         """Return these settings with (nested) differences applied and validated."""
