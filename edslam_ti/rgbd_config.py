@@ -58,7 +58,7 @@ class SplatamMappingConfig(Stage):
     """Every n-th mapped frame is kept as a keyframe."""
     window: int = Field(24, ge=2)
     """At most this many views are drawn from: keyframes that overlap, the last keyframe, the new frame."""
-    image_width: int = Field(384, ge=16)
+    image_width: int = Field(320, ge=16)
     """Images are divided by a whole number until just above this width (the authors': whole images)."""
     pixel_stride: int = Field(1, ge=1)
     """One new Gaussian for every stride x stride pixels that need one."""
@@ -66,6 +66,8 @@ class SplatamMappingConfig(Stage):
     """Pixels where the map has a smaller alpha get new Gaussians."""
     depth_error_factor: float = Field(50.0, gt=0)
     """So do pixels where the map lies behind by more than this multiple of the median depth error."""
+    initial_size: float = Field(1.0, gt=0)
+    """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
     initial_opacity: float = Field(0.5, gt=0, lt=1)
     """Opacity of a new Gaussian."""
     image_weight: float = Field(0.5, ge=0)

@@ -18,7 +18,7 @@ class IsotropicMap:
     """
 
     def __init__(self) -> None:
-        self.device = torch.device("cuda" if is_gpu() else "cpu")
+        self.device = "cuda" if is_gpu() else "cpu"
         self._raw = {
             name: torch.empty((0, width) if width else (0,), device=self.device)
             for name, width in PARAMETERS.items()
@@ -74,13 +74,13 @@ def activated(raw: dict[str, Tensor]) -> Gaussians:
     scales = raw["log_scales"].exp().expand(-1, 3)
     return Gaussians(
         raw["means"],
-        no_rotation(len(scales), scales.device),
+        no_rotation(scales),
         scales,
         raw["logit_opacities"].sigmoid(),
         raw["colors"],
     )
 
 
-def no_rotation(count: int, device: torch.device) -> Tensor:  # [N, 4] wxyz
+def no_rotation(scales: Tensor) -> Tensor:  # [N, 3] -> [N, 4] wxyz
     """Return quaternions of spheres, whose orientation has no effect."""
-    return torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(count, 4)
+    return scales.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(scales), 4)

@@ -125,8 +125,8 @@ class SplatamMapper:
     def save(self, folder: Path) -> None:
         """Write map.ply, the Gaussians in the layout of 3D Gaussian splatting."""
         raw = {name: value.cpu().numpy() for name, value in self._gaussians.raw.items()}
-        quats = no_rotation(len(self._gaussians), torch.device("cpu")).numpy()
         log_scales = np.repeat(raw["log_scales"], 3, axis=1)
+        quats = no_rotation(torch.from_numpy(log_scales)).numpy()
         colors = np.clip(raw["colors"], 0, 1)
         write_gaussian_ply(
             folder / "map.ply", raw["means"], quats, log_scales, raw["logit_opacities"], colors
@@ -154,7 +154,8 @@ class SplatamMapper:
         points = self._rays[mask] * depth[:, None]
         means = points @ T[:3, :3].float().T + T[:3, 3].float()
         focal_length = 0.5 * (self._scale.camera.fx + self._scale.camera.fy)
-        self._gaussians.add(means, stride * depth / focal_length, config.initial_opacity, new.image[mask])
+        scales = config.initial_size * stride * depth / focal_length
+        self._gaussians.add(means, scales, config.initial_opacity, new.image[mask])
 
     # --- optimising ---
 

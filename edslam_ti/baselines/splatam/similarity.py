@@ -25,7 +25,7 @@ class Similarity:
     torch's convolution with one channel.
     """
 
-    def __init__(self, height: int, width: int, device: torch.device) -> None:
+    def __init__(self, height: int, width: int, device: str) -> None:
         self._down, self._across = _blur(height, device), _blur(width, device)
 
     def target(self, image: Tensor) -> Target:  # [H, W]
@@ -46,7 +46,7 @@ class Similarity:
         return self._down @ images @ self._across
 
 
-def _blur(size: int, device: torch.device) -> Tensor:  # [size, size], symmetric
+def _blur(size: int, device: str) -> Tensor:  # [size, size], symmetric
     offset = torch.arange(size, dtype=torch.float32, device=device)
     distance = (offset[:, None] - offset[None]).abs()
     weights = torch.exp(-(distance**2) / (2 * SIGMA**2)) * (distance <= WINDOW // 2)

@@ -16,7 +16,7 @@ from edslam_ti.mapping.gaussians import Gaussians
 class Scale:
     """The camera of images averaged over blocks, and what turns frames into tensors of its size."""
 
-    def __init__(self, camera: Camera, width: int, device: torch.device) -> None:
+    def __init__(self, camera: Camera, width: int, device: str) -> None:
         """`width`: pixels; the image is divided by the whole number that brings it nearest from above."""
         self.reduction = max(camera.width // width, 1)
         self.camera = camera if self.reduction == 1 else camera.downscaled(self.reduction)
