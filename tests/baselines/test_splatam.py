@@ -78,6 +78,36 @@ def test_frames_that_cannot_be_tracked_are_predicted_and_not_mapped(
     assert slam.process(replace(tiny_samples[2], timestamp=0.2)).converged
 
 
+def test_map_begins_with_the_first_complete_frame(started: Started, tiny_samples: list[Sample]) -> None:
+    slam = started()
+    results = [slam.process(replace(tiny_samples[0], depth=None)), slam.process(tiny_samples[1])]
+    assert [result.converged for result in results] == [False, True]
+    assert len(mapper_of(slam).map) > 1000
+    assert slam.process(tiny_samples[2]).converged
+
+
+def test_after_a_sudden_stop_the_last_pose_is_tried_too(
+    started: Started, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]
+) -> None:
+    slam = started()
+    slam.process(tiny_samples[0])
+    far = tiny_samples[0].T_world_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way
+    frame = slam.frame_builder.build(tiny_samples[1])
+    result = slam.tracker.track(frame, far, slam.trajectory)
+    assert result.converged
+    assert np.linalg.norm(result.T_world_camera[:3, 3] - tiny_samples[1].T_world_camera[:3, 3]) < 0.05
+
+
+def test_sparse_depth_is_mapped_at_reduced_size(started: Started, tiny_samples: list[Sample]) -> None:
+    width = {"image_width": 60}
+    slam = started(splatam={"tracking": FEW["tracking"] | width, "mapping": FEW["mapping"] | width})
+    for sample in tiny_samples[:2]:
+        lines = np.zeros_like(sample.depth)
+        lines[::4] = sample.depth[::4]
+        assert slam.process(replace(sample, depth=lines)).converged
+    assert len(mapper_of(slam).map) > 500
+
+
 def test_frame_held_out_changes_nothing_in_the_map(started: Started, tiny_samples: list[Sample]) -> None:
     slam = started()
     slam.process(tiny_samples[0])

@@ -70,9 +70,11 @@ class SplatamMapper:
 
     def update(self, frame: Frame, trajectory: Trajectory) -> None:
         """Add Gaussians for the newest frame and optimise; nothing for a frame held out or incomplete."""
-        if frame.is_held_out or frame.depth is None or frame.image is None or not (frame.depth > 0).any():
+        if frame.is_held_out or frame.depth is None or frame.image is None:
             return
         new = Observation(len(trajectory) - 1, self._scale.image(frame.image), self._scale.depth(frame.depth))
+        if not bool(new.depth.any()):
+            return
         if self._num_mapped == 0:
             self._scene_radius = SCENE_SHARE * float(new.depth.max())
         self._grow(new, trajectory)

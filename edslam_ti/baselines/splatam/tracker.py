@@ -36,33 +36,41 @@ class SplatamTracker:
         self._map = gaussians
         self._config = config.tracking
         self._scale = Scale(camera, config.tracking.image_width, gaussians.device)
+        self._last: np.ndarray | None = None  # [4, 4] the last pose that was found
 
     def track(self, frame: Frame, T_world_camera_guess: np.ndarray, trajectory: Trajectory) -> TrackingResult:
         """Return the pose of `frame`; where it cannot be found, the guess, marked as lost."""
-        if len(trajectory) == 0:
-            return TrackingResult(T_world_camera_guess, True, 1.0)
-        problem = self._problem(frame)
-        if problem:
-            return _lost(T_world_camera_guess, f"{problem}: pose predicted", trajectory)
-        assert frame.depth is not None
-        assert frame.image is not None
-        image, depth = self._scale.image(frame.image), self._scale.depth(frame.depth)
-        found = self._aligned(image, depth, T_world_camera_guess)
-        if found.agreement < self._config.min_agreement:
-            message = f"the map explains only {found.agreement:.0%} of the depth: pose predicted"
-            return _lost(T_world_camera_guess, message, trajectory, found.agreement)
-        return TrackingResult(orthonormalized(found.T_world_camera), True, found.agreement)
+        problem, found = self._found(frame, T_world_camera_guess)
+        if problem or found is None:
+            # Kept from the map, which a wrong pose would spoil.
+            quality, lost = 0.0 if found is None else found.agreement, (len(trajectory),)
+            message = f"{problem}: pose predicted"
+            return TrackingResult(T_world_camera_guess, False, quality, message, distrusted=lost)
+        self._last = orthonormalized(found.T_world_camera)
+        return TrackingResult(self._last, True, found.agreement)
 
     def consistency(self, trajectory: Trajectory) -> None:
         """Return None: it does not compare its data."""
 
-    def _problem(self, frame: Frame) -> str:
-        """Return why a frame cannot be aligned, if so."""
+    def _found(self, frame: Frame, T_guess: np.ndarray) -> tuple[str, Alignment | None]:
+        """Return why the frame is lost, if so, and the best alignment, if any was tried.
+
+        A frame that does not fit from the predicted pose is aligned again from the last pose that was found:
+        the camera may have stopped.
+        """
         if frame.depth is None or frame.image is None:
-            return f"no {'depth image' if frame.depth is None else 'image'} at this time"
-        if not (frame.depth > 0).any():
-            return "depth at no pixel"
-        return "" if len(self._map) else "the map is empty"
+            return f"no {'depth image' if frame.depth is None else 'image'} at this time", None
+        image, depth = self._scale.image(frame.image), self._scale.depth(frame.depth)
+        if not bool(depth.any()):
+            return "depth at no pixel", None
+        if len(self._map) == 0:
+            return "", Alignment(T_guess, 1.0)  # the map begins with this frame
+        found, least = self._aligned(image, depth, T_guess), self._config.min_agreement
+        if found.agreement < least and self._last is not None:
+            again = self._aligned(image, depth, self._last)
+            found = again if again.agreement > found.agreement else found
+        problem = f"the map explains only {found.agreement:.0%} of the depth"
+        return "" if found.agreement >= least else problem, found
 
     def _aligned(
         self,
@@ -107,8 +115,3 @@ class SplatamTracker:
         is_known, is_near = view.alpha > 0.5, (view.depth / view.alpha.clamp_min(0.5) - depth).abs()
         agrees = is_known & (is_near < self._config.max_depth_difference) & (depth > 0)
         return float(agrees.sum() / (depth > 0).sum().clamp_min(1))
-
-
-def _lost(T_guess: np.ndarray, message: str, trajectory: Trajectory, quality: float = 0.0) -> TrackingResult:
-    """Return a failure; the frame is kept from the map, which a wrong pose would spoil."""
-    return TrackingResult(T_guess, False, quality, message, distrusted=(len(trajectory),))

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from edslam_ti.baselines.splatam.gaussian_map import IsotropicMap
 from edslam_ti.camera import Camera
-from edslam_ti.depth_images import block_depth, block_means
+from edslam_ti.depth_images import block_means, measured_means
 from edslam_ti.kernels.culling import drawable
 from edslam_ti.kernels.projection import LOW_PASS
 from edslam_ti.kernels.rasterization import Rasterization, rasterize
@@ -27,9 +27,9 @@ class Scale:
         return self._tensor(block_means(image, self.reduction))
 
     def depth(self, depth: np.ndarray) -> Tensor:  # [H, W] metres, 0 = missing -> [h, w]
-        """Return block means of depth, 0 where a block lies on no single surface."""
+        """Return means of the depths in a block, 0 where they lie on no single surface."""
         finite = np.where(np.isfinite(depth) & (depth > 0), depth, 0)
-        return self._tensor(block_depth(finite, self.reduction))
+        return self._tensor(measured_means(finite, self.reduction))
 
     def rays(self) -> Tensor:  # [h, w, 3]
         """Return the viewing rays, scaled to z = 1."""
