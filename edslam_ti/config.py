@@ -5,31 +5,18 @@ that names the field. A field that was renamed keeps its old name for files and 
 `new: int = Field(3, validation_alias=AliasChoices("new", "old"))`.
 """
 
-import difflib
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import yaml
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, Field
 from pydantic.fields import FieldInfo
 
-from edslam_ti.errors import ConfigError, EdSlamError, plain, shown
+from edslam_ti.errors import ConfigError, EdSlamError, plain
+from edslam_ti.rgbd_config import SmallGicpConfig, SplatamConfig
+from edslam_ti.stage import Stage
 
 CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: settings for a data set
-
-
-class Stage(BaseModel):
-    """Base of every stage's settings, and of every command's options: immutable, no unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-
-    @classmethod
-    def validated(cls, values: dict[str, Any], source: str) -> Self:
-        """Return settings of these (nested) values; a ConfigError names the source and the wrong field."""
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise ConfigError(f"{source}: {_first_problem(cls, error)}") from error
 
 
 class TimeSurfaceConfig(Stage):
@@ -287,6 +274,8 @@ class Config(Stage):
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    small_gicp: SmallGicpConfig = SmallGicpConfig()
+    splatam: SplatamConfig = SplatamConfig()
 
     def updated(self, differences: dict[str, Any]) -> Self:
         """Return these settings with (nested) differences applied and validated."""
@@ -356,19 +345,3 @@ def merged(base: dict[str, Any], differences: dict[str, Any]) -> dict[str, Any]:
         old = result.get(key)
         result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return result
-
-
-def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
-    """Return one line on the first problem; an unknown key comes with its nearest valid name."""
-    problem = error.errors()[0]
-    name = ".".join(str(part) for part in problem["loc"])
-    if not name:  # of several fields together
-        return str(problem["msg"]).removeprefix("Value error, ")
-    if problem["type"] != "extra_forbidden":
-        return f"{name}: {problem['msg']}, got {shown(problem['input'])}"
-    stage: Any = model
-    for part in problem["loc"][:-1]:
-        stage = stage.model_fields[part].annotation
-    close = difflib.get_close_matches(str(problem["loc"][-1]), stage.model_fields, n=1)
-    hint = f"; did you mean '{close[0]}'?" if close else f"; known: {', '.join(stage.model_fields)}"
-    return f"unknown key '{plain(name, 60)}'{hint}"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from edslam_ti.errors import DataError
+from edslam_ti.errors import ConfigError, DataError
 
 if TYPE_CHECKING:  # `--help` must not load Taichi or Open3D
     from edslam_ti.config import Config
@@ -73,6 +73,31 @@ def _kiss_icp(
     return KissIcpTracker(sequence.camera), TsdfMapper(sequence.camera)
 
 
+def _small_gicp(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    from edslam_ti.baselines.gicp import SmallGicpTracker
+    from edslam_ti.baselines.open3d_rgbd import TsdfMapper
+
+    return SmallGicpTracker(sequence.camera, config.small_gicp), TsdfMapper(sequence.camera)
+
+
+def _splatam(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    if not config.mapping.enabled:
+        raise ConfigError(
+            "mapping.enabled: method splatam tracks by its map, so it cannot be off; use --method open3d_rgbd"
+        )
+    from edslam_ti.baselines.open3d_rgbd import require_images
+    from edslam_ti.baselines.splatam.mapper import SplatamMapper
+    from edslam_ti.baselines.splatam.tracker import SplatamTracker
+
+    require_images(sequence, config.method)
+    mapper = SplatamMapper(sequence.camera, config)
+    return SplatamTracker(sequence.camera, mapper.map, config.splatam), mapper
+
+
 METHODS: dict[str, Method] = {
     "ed_slam": Method(
         "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
@@ -90,5 +115,13 @@ METHODS: dict[str, Method] = {
     ),
     "kiss_icp": Method(
         "KISS-ICP (where installed) on points of the depth images, TSDF volume; uses no events", _kiss_icp
+    ),
+    "small_gicp": Method(
+        "generalised ICP of depth (package small_gicp) to keyframes, TSDF volume; uses no events", _small_gicp
+    ),
+    "splatam": Method(
+        "SplaTAM, implemented from its paper: tracks and maps by renders of Gaussians; needs images, uses no "
+        "events",
+        _splatam,
     ),
 }

@@ -15,7 +15,7 @@ RANKS: list[list[str]] = [
         *("open3d_loader", "ply_check", "mesh_reading", "cold_start", "interruption"),
         *("patient_console", "object_graph"),
     ],
-    ["config", "arguments", "geometry", "camera", "events", "tables"],
+    ["stage", "rgbd_config", "config", "arguments", "geometry", "camera", "events", "tables"],
     [
         *("trajectory", "truth", "journal", "depth_images", "lenses", "depth_reprojection", "ray_casting"),
         *("alignment", "simulation", "event_files"),
@@ -39,7 +39,7 @@ ORDERS: dict[str, list[str]] = {
         *("errors", "memory", "leftovers", "output", "cache"),
         *("open3d_loader", "ply_check", "mesh_reading", "kernels", "cold_start", "interruption"),
         *("patient_console", "object_graph"),
-        *("config", "arguments", "geometry", "camera", "events", "tables"),
+        *("stage", "rgbd_config", "config", "arguments", "geometry", "camera", "events", "tables"),
         *(
             "trajectory",
             "truth",
@@ -99,7 +99,7 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": [
         "experiments.paper_options",
-        "config",
+        *("stage", "rgbd_config", "config"),
         "arguments",
         "checkpoint",
         "command_line",
@@ -128,6 +128,7 @@ LIBRARIES: dict[str, list[str]] = {
     "evo": ["evaluation"],
     "skimage": ["evaluation"],
     "kiss_icp": ["baselines"],
+    "small_gicp": ["baselines"],
     "lpips": ["evaluation"],
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
@@ -156,6 +157,7 @@ USES_OPEN3D = [
 HEAVY = {
     "open3d",
     "kiss_icp",
+    "small_gicp",
     "matplotlib",
     "evo",
     "skimage",

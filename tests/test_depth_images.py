@@ -12,6 +12,7 @@ from edslam_ti.depth_images import (
     downscaled,
     downscaled_depth,
     is_smooth,
+    measured_means,
     with_gaps_filled,
     with_holes_filled,
     without_depth_edges,
@@ -149,3 +150,14 @@ def test_a_few_pixels_alone_are_not_joined(number: int) -> None:
     filled = with_gaps_filled(depth)
     assert (filled > 0).sum() < 60 + number
     assert (filled[depth > 0] == depth[depth > 0]).all()
+
+
+def test_means_of_partly_measured_blocks_stay_on_their_surface() -> None:
+    depth = np.full((4, 8), 2.0, np.float32)
+    depth[0] = 0  # a line that the sensor missed
+    depth[:2, 2:4] = 0  # nothing in a block
+    depth[3, 5] = 3.0  # two surfaces in a block
+    depth[2, 6] = 2.02
+    expected = np.array([[2, 0, 2, 2], [2, 2, 0, 2.005]])
+    np.testing.assert_allclose(measured_means(depth, 2), expected, rtol=1e-6)
+    np.testing.assert_array_equal(measured_means(depth, 1), depth)

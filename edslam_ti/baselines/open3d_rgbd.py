@@ -100,15 +100,21 @@ class RgbdOdometryTracker(OdometryTracker):
 
     def __init__(self, sequence: EventDepthSequence) -> None:
         """Check that the sequence has images at the times of depth."""
-        depth_times, image_times = sequence.depth_timestamps, sequence.image_timestamps
-        gaps = np.abs(depth_times[:, None] - image_times[None]).min(1, initial=np.inf)  # [D] seconds
-        if np.count_nonzero(gaps <= 1e-3) < 2:
-            raise DataError(
-                f"{sequence.scene}: method open3d_rgbd needs images taken with the depth images, got "
-                f"{len(image_times)} images and {len(depth_times)} depth images, fewer than 2 of them "
-                "within 1 ms of each other; use --method ed_slam"
-            )
+        require_images(sequence, "open3d_rgbd")
         super().__init__(sequence.camera, "Hybrid")
+
+
+def require_images(sequence: EventDepthSequence, method: str) -> None:
+    """Raise DataError unless a sequence has images at the times of depth."""
+    depth_times, image_times = sequence.depth_timestamps, sequence.image_timestamps
+    gaps = np.abs(depth_times[:, None] - image_times[None]).min(1, initial=np.inf)  # [D] seconds
+    if np.count_nonzero(gaps <= 1e-3) < 2:
+        other = "ed_slam" if sequence.has_events else "open3d_icp"
+        raise DataError(
+            f"{sequence.scene}: method {method} needs images taken with the depth images, got "
+            f"{len(image_times)} images and {len(depth_times)} depth images, fewer than 2 of them "
+            f"within 1 ms of each other; use --method {other}"
+        )
 
 
 class TsdfMapper:

@@ -179,7 +179,7 @@ def test_a_recording_without_events_is_tracked(tiny_sequence: EventDepthSequence
     (folder / "camera.json").write_text('{"frame_rate": 20}')
     sequence = RgbdSequence(folder)
     samples = SampledSequence(sequence, 0.0, None, 0.05)
-    for method in ("open3d_rgbd", "open3d_icp"):
+    for method in ("open3d_rgbd", "open3d_icp", "small_gicp"):
         config = settings(method, mapping={"enabled": False})
         slam = make_slam(config, sequence, samples, contrast_of(config, sequence, samples))
         for sample in samples:

@@ -15,14 +15,15 @@ MEMBERS = [name for name in vars(Mapper) if not name.startswith("_")]
 
 def mapped(sequence: EventDepthSequence, samples: list[Sample], method: str) -> Mapper:
     """Return the mapper of a method after a few frames."""
-    slam = make_slam(sequence, samples, settings(method, mapping={"iterations": 1}, poses="truth"))
+    few = {"mapping": {"iterations": 1}, "splatam": {"mapping": {"iterations": 1}}}
+    slam = make_slam(sequence, samples, settings(method, **few, poses="truth"))
     for sample in samples[:4]:
         slam.process(sample)
     assert slam.mapper is not None
     return slam.mapper
 
 
-@pytest.mark.parametrize("method", ["ed_slam", "open3d_rgbd", "open3d_icp"])
+@pytest.mark.parametrize("method", ["ed_slam", "open3d_rgbd", "open3d_icp", "splatam"])
 def test_every_mapper_is_complete(
     method: str, tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], tmp_path: Path
 ) -> None:
