@@ -19,10 +19,12 @@ from typing import NamedTuple
 
 from edslam_ti.config import Config
 from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence, WrappedSequence
+from edslam_ti.datasets.camera_file import read_camera
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
+from edslam_ti.datasets.generic import GenericSequence, is_generic
 from edslam_ti.datasets.rgbd import RgbdSequence, is_rgbd
 from edslam_ti.datasets.rpg import RpgSequence, is_rpg
-from edslam_ti.errors import ConfigError
+from edslam_ti.errors import ConfigError, plain
 
 __all__ = [
     "FORMATS",
@@ -33,7 +35,9 @@ __all__ = [
     "SampledSequence",
     "WrappedSequence",
     "find_sequence",
+    "open_folder",
     "open_sequence",
+    "preset_of",
 ]
 
 
@@ -83,6 +87,11 @@ FORMATS: dict[str, Format] = {
         ),
         is_event_replica,
     ),
+    "generic": Format(
+        "generic layout, with camera.json and events.* or depth.txt",
+        lambda folder, config: GenericSequence(folder),
+        is_generic,
+    ),
     "rpg": Format(
         "RPG Event Camera Dataset's layout, with events.txt",
         lambda folder, config: RpgSequence(folder),
@@ -123,6 +132,18 @@ def find_sequence(config: Config) -> Found:
     raise _not_found(config, FORMATS)
 
 
+def preset_of(config: Config) -> str:
+    """Return the data set whose settings fit the scene that the settings name; raises as `find_sequence`.
+
+    It is the scene's own, unless its camera.json states another one.
+    """
+    found = find_sequence(config)
+    stated = found.folder / "camera.json" if found.folder is not None else None
+    if found.dataset in ("event_replica", "generic") and stated is not None and stated.is_file():
+        return read_camera(stated).preset or found.dataset
+    return found.dataset
+
+
 def open_sequence(config: Config) -> EventDepthSequence:
     """Open the scene that the settings name; a built-in one is simulated on first use (Taichi must run).
 
@@ -141,6 +162,24 @@ def open_sequence(config: Config) -> EventDepthSequence:
         assert format.make is not None, f"{found.dataset}: has scenes but no way to make them"
         folder = format.make(config.scene)
     return format.open(folder, config)
+
+
+def open_folder(folder: Path, config: Config) -> EventDepthSequence:
+    """Open the recording in a folder, in the layout that the settings name, else in the one it looks like.
+
+    Raises what `open_sequence` raises.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{plain(folder, 400)}: expected the folder of a recording, found no such folder")
+    if config.dataset is not None and config.dataset not in FORMATS:
+        _find_in(config, config.dataset)  # raises, naming the nearest
+    names = [name for name, format in FORMATS.items() if format.detect(folder)]
+    if config.dataset is None and len(names) > 1:
+        raise ConfigError(f"{folder}: looks like {' and like '.join(names)}; choose one with --dataset")
+    if config.dataset is None and not names:
+        known = "; ".join(f"{name} ({f.description})" for name, f in FORMATS.items() if not f.scenes())
+        raise ConfigError(f"{folder}: in no known layout; expected one of {known}")
+    return FORMATS[config.dataset or names[0]].open(folder, config)
 
 
 def _find_in(config: Config, dataset: str) -> Found:
