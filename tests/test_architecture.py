@@ -16,7 +16,16 @@ RANKS: list[list[str]] = [
         *("patient_console", "object_graph"),
     ],
     ["config", "arguments", "geometry", "camera", "events", "tables"],
-    ["trajectory", "truth", "journal", "depth_images", "ray_casting", "alignment", "simulation"],
+    [
+        "trajectory",
+        "truth",
+        "journal",
+        "depth_images",
+        "ray_casting",
+        "alignment",
+        "simulation",
+        "event_files",
+    ],
     ["datasets"],
     ["frame", "evaluation", "conversion"],
     ["event_images"],
@@ -45,6 +54,7 @@ ORDERS: dict[str, list[str]] = {
             "ray_casting",
             "alignment",
             "simulation",
+            "event_files",
             "frame",
             "conversion",
         ),
@@ -116,7 +126,9 @@ LIBRARIES: dict[str, list[str]] = {
     "numba": ["experiments.kernel_times"],
     "dv_processing": ["experiments.kernel_times"],
     "matplotlib": ["results"],
-    "rich": ["patient_console", "datasets", "results", "pipeline", "experiments", "commands"],
+    "h5py": ["event_files"],
+    "hdf5plugin": ["event_files"],
+    "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
 }
 USES_OPEN3D = [
@@ -132,7 +144,18 @@ USES_OPEN3D = [
     *("baselines", "results", "viewer"),
 ]
 # They take seconds to load, and a machine without a display or a GPU may lack what they need.
-HEAVY = {"open3d", "kiss_icp", "matplotlib", "evo", "skimage", "lpips", "rosbags", "h5py"}
+HEAVY = {
+    "open3d",
+    "kiss_icp",
+    "matplotlib",
+    "evo",
+    "skimage",
+    "lpips",
+    "rosbags",
+    "h5py",
+    "hdf5plugin",
+    "aedat",
+}
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more
 

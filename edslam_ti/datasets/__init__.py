@@ -4,7 +4,7 @@ To add a data set:
 
 1. Write `datasets/<name>.py` with a subclass of `EventDepthSequence` (base.py). Its constructor takes the
    folder of one scene, sets every attribute of the base class, and checks the files as far as it can without
-   reading everything. files.py reads tables and images, depth.py depth, event_file.py events slice by slice.
+   reading everything. files.py reads tables and images, depth.py depth, edslam_ti/event_files events.
 2. Add a line to `FORMATS`: how to open a folder, how to detect it, one line about the layout.
    `--dataset <name>`, automatic detection and the lists in error messages follow from that line.
 3. Write `configs/<name>.yaml` if the sensor needs settings that differ from the defaults.

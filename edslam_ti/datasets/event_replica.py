@@ -31,12 +31,12 @@ from edslam_ti.datasets.base import EventDepthSequence, NovelView, stamp_text
 from edslam_ti.datasets.camera_file import CameraFile, read_camera
 from edslam_ti.datasets.clocks import check_clock, check_milliseconds, clock_offset, note_coverage
 from edslam_ti.datasets.depth import look_at_images, read_depth
-from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.datasets.exr import read_grey
 from edslam_ti.datasets.files import numbered_files, read_timestamps
 from edslam_ti.datasets.novel_views import read_novel_views
 from edslam_ti.datasets.truth import read_timed_poses
 from edslam_ti.errors import DataError, plain
+from edslam_ti.event_files.checked import EventFile
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory
 

@@ -28,7 +28,6 @@ from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.datasets.camera_file import read_camera
 from edslam_ti.datasets.clocks import check_clock, clock_offset, note_coverage
 from edslam_ti.datasets.depth import look_at_images, read_depth
-from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.datasets.files import (
     first_image_size,
     numbered_files,
@@ -37,6 +36,7 @@ from edslam_ti.datasets.files import (
     read_timed_paths,
 )
 from edslam_ti.errors import DataError, plain
+from edslam_ti.event_files.checked import EventFile
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory, read_tum
 

@@ -10,7 +10,7 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.config import TimeSurfaceConfig
 from edslam_ti.datasets.base import Sample
-from edslam_ti.datasets.event_file import IN_MEMORY, EventFile
+from edslam_ti.event_files.checked import IN_MEMORY, EventFile
 from edslam_ti.event_images.change import BrightnessChange
 from edslam_ti.experiments.kernel_times import OURS, Row, Stopwatch, Work
 from edslam_ti.frame import FrameBuilder

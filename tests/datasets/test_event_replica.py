@@ -14,9 +14,9 @@ import pytest
 from written_sequences import CAMERA, HEIGHT, WIDTH, save_events, some_events, write_sequence
 
 from edslam_ti.datasets import SampledSequence
-from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import DataError
+from edslam_ti.event_files.checked import EventFile
 
 
 def read_all(folder: Path) -> None:

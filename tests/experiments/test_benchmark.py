@@ -188,7 +188,7 @@ def test_the_front_end_is_timed_in_a_cache_of_its_own(
 ) -> None:
     monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path))
     monkeypatch.setattr("edslam_ti.experiments.front_end.IN_MEMORY", 10_000)
-    monkeypatch.setattr("edslam_ti.datasets.event_file.IN_MEMORY", 10_000)
+    monkeypatch.setattr("edslam_ti.event_files.checked.IN_MEMORY", 10_000)
     rows = list(front_end((64, 48), 5_000, Stopwatch(1)))
     assert [row.task.split(": ")[1] for row in rows] == ["check and copy", "read, count, time surface"]
     assert all(row.wall_ms > 0 for row in rows)

@@ -8,8 +8,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from edslam_ti.datasets.event_rows import BLOCK, EventSource, RowBlock
 from edslam_ti.errors import DataError
+from edslam_ti.event_files.rows import BLOCK, EventSource, RowBlock
 from edslam_ti.events import Events
 
 DISORDER = 5e-3  # s: simulators sort in blocks of 1 ms or so, not globally (gray_events_data.npy)
@@ -51,21 +51,30 @@ def recognised_columns(source: EventSource, size: tuple[int, int]) -> Columns:
     Raises `DataError` for times that are not in seconds.
     """
     rows = source.sample()
-    order = source.columns
-    if len(rows) >= ENOUGH_TO_TELL and not _fits(rows, order, size):
-        fitting = [other for other in ORDERS if _fits(rows, other, size)]
-        order = fitting[0] if len(fitting) == 1 else order
+    order = detected_order(rows, source.columns, size)
     t = rows[:, order.index("t")]
     t = t[np.isfinite(t)]
     if len(t) and (span := float(np.subtract(*np.percentile(t, [99, 1])))) > LONGEST_RECORDING:
         _refuse_unit(source, order, span)
-    return Columns(order, _negative(rows[:, order.index("p")]))
+    return Columns(order, negative_polarity(rows[:, order.index("p")]))
+
+
+def detected_order(
+    rows: np.ndarray,  # [S, 4]
+    expected: str,
+    size: tuple[int, int],
+) -> str:
+    """Return the order of columns: the expected one, unless another one alone fits the values."""
+    if len(rows) < ENOUGH_TO_TELL or _fits(rows, expected, size):
+        return expected
+    fitting = [other for other in ORDERS if _fits(rows, other, size)]
+    return fitting[0] if len(fitting) == 1 else expected
 
 
 def _fits(rows: np.ndarray, order: str, size: tuple[int, int]) -> bool:  # [S, 4]
     """Return whether nearly all rows are plausible in an order of columns."""
     x, y, t, p = (rows[:, order.index(name)] for name in "xytp")
-    negative = _negative(p)
+    negative = negative_polarity(p)
     with np.errstate(invalid="ignore"):
         good = (x >= 0) & (x < size[0]) & (x == np.rint(x)) & (y >= 0) & (y < size[1]) & (y == np.rint(y))
         good &= np.isfinite(t) & ((p == 1) | (p == (1 if negative is None else negative)))
@@ -76,7 +85,7 @@ def _fits(rows: np.ndarray, order: str, size: tuple[int, int]) -> bool:  # [S, 4
         return bool((np.diff(t) < -tolerance).mean() <= MOST_BAD) if len(t) > 1 else True
 
 
-def _negative(polarity: np.ndarray) -> float | None:
+def negative_polarity(polarity: np.ndarray) -> float | None:
     """Return the number for negative events: the more frequent of -1 and 0."""
     minus, zero = int((polarity == -1).sum()), int((polarity == 0).sum())
     return None if minus + zero == 0 else -1.0 if minus >= zero else 0.0
@@ -129,7 +138,15 @@ class EventChecker:
             if block is None:
                 break
             self.share = block.share
-            yield self._check(block, following)
+            yield self.check(block, following)
+        self.end()
+
+    def begin_after(self, oldest: float) -> None:
+        """Start in the middle of a recording whose first stamp is known (s)."""
+        self._oldest = oldest
+
+    def end(self) -> None:
+        """Refuse a file without events, or with too many bad ones among all."""
         if self.num_rows == 0:
             expected = " ".join(self._source.columns)
             raise DataError(f"{self._source.name}: expected events '{expected}', got none")
@@ -151,13 +168,14 @@ class EventChecker:
         self._merge_at = 2 * len(rest) + BLOCK // 2
         return events[:number]
 
-    def _check(self, block: RowBlock, following: RowBlock | None) -> tuple[Events, np.ndarray]:
+    def check(self, block: RowBlock, following: RowBlock | None) -> tuple[Events, np.ndarray]:
+        """Return a block's good events, and a mask of their rows (bool); blocks come one after the other."""
         x, y, t, p = (np.ascontiguousarray(block.rows[:, self._columns.index(name)]) for name in "xytp")
         t = t.astype(np.float64, copy=False)
         with np.errstate(invalid="ignore"):  # NaN to int: caught by the comparison
             column, row = x.astype(np.int16), y.astype(np.int16)
         if self._negative is None:
-            self._negative = _negative(p)
+            self._negative = negative_polarity(p)
         positive = p == 1
         is_place = (column == x) & (row == y)
         # Negative numbers are large as unsigned ones.
@@ -289,6 +307,14 @@ class EventChecker:
 
     def _refuse(self, problem: str) -> NoReturn:
         raise DataError(f"{self._source.name}: {problem}")
+
+
+def bad_rows_note(bad: BadRows, num_rows: int, counted: str) -> list[str]:
+    """Return the sentence about rows that were left out, if any were."""
+    if not bad.number:
+        return []
+    are = "are" if bad.number > 1 else "is"
+    return [f"{bad.number} of {num_rows} {counted}s {are} bad and left out, first {bad.first}"]
 
 
 def sorted_by_time(events: Events) -> Events:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from edslam_ti.datasets.event_rows import RowBlock
 from edslam_ti.errors import DataError
+from edslam_ti.event_files.rows import RowBlock
 
 CHUNK = 4_000_000  # characters read at once, some 200,000 lines
 LONGEST_LINE = 10_000  # characters; a longer one is cut into several

@@ -13,9 +13,9 @@ import psutil
 import pytest
 from written_sequences import HEIGHT, WIDTH, some_events
 
-from edslam_ti.datasets import event_checks, event_copy, event_file
-from edslam_ti.datasets.event_file import EventFile
 from edslam_ti.errors import DataError
+from edslam_ti.event_files import checked, checks, copies
+from edslam_ti.event_files.checked import EventFile
 from edslam_ti.events import Events
 
 
@@ -28,9 +28,9 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def copied(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small files are copied, too, and read in many blocks."""
-    monkeypatch.setattr(event_file, "IN_MEMORY", 0)
-    for module in ("event_rows", "event_checks", "event_file"):
-        monkeypatch.setattr(f"edslam_ti.datasets.{module}.BLOCK", 500)
+    monkeypatch.setattr(checked, "IN_MEMORY", 0)
+    for module in ("rows", "checks", "checked"):
+        monkeypatch.setattr(f"edslam_ti.event_files.{module}.BLOCK", 500)
 
 
 def saved(folder: Path, events: np.ndarray) -> Path:
@@ -109,8 +109,8 @@ def test_numbers_that_a_damaged_disk_made_are_refused(
     events = opened(saved(tmp_path, some_events()))
     [folder] = cache.iterdir()
     with (folder / f"{name}.bin").open("r+b") as file:
-        file.seek(1000 * event_copy.DTYPES[name].itemsize)
-        file.write(bytes([byte]) * event_copy.DTYPES[name].itemsize)
+        file.seek(1000 * copies.DTYPES[name].itemsize)
+        file.write(bytes([byte]) * copies.DTYPES[name].itemsize)
     with pytest.raises(DataError, match="damaged; remove it"):
         events.between(0, 1)
 
@@ -118,13 +118,13 @@ def test_numbers_that_a_damaged_disk_made_are_refused(
 KILLED = """
 import os, sys
 from pathlib import Path
-from edslam_ti.datasets import event_checks, event_file, event_rows
-event_file.IN_MEMORY = 0
-event_rows.BLOCK = event_checks.BLOCK = 500
+from edslam_ti.event_files import checked, checks, rows
+checked.IN_MEMORY = 0
+rows.BLOCK = checks.BLOCK = 500
 def progress(share):
     if share > 0.5:
         os.kill(os.getpid(), 9)
-event_file.EventFile(Path(sys.argv[1]), 32, 24, progress=progress)
+checked.EventFile(Path(sys.argv[1]), 32, 24, progress=progress)
 """
 
 
@@ -164,13 +164,13 @@ def test_without_a_copy_events_are_the_same(
     if fault == "a file in its place":
         cache.write_text("")
     elif fault == "no room":
-        monkeypatch.setattr(event_copy, "SPARE_ROOM", 10**18)
+        monkeypatch.setattr(copies, "SPARE_ROOM", 10**18)
     else:
 
         def full(file: int) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        monkeypatch.setattr("edslam_ti.datasets.event_copy.os.fsync", full)
+        monkeypatch.setattr("edslam_ti.event_files.copies.os.fsync", full)
     caplog.clear()
     events = opened(path, is_text=is_text)
     assert "they are checked again each time" in caplog.records[0].message
@@ -297,7 +297,7 @@ def test_a_bad_stretch_of_a_long_file_is_refused(tmp_path: Path) -> None:
     rows[10_000:10_060, 0] = -1  # 0.3 % of all, 1.5 % of eight blocks
     with pytest.raises(DataError, match=r"row 10000: .*; 60 of 4000 rows are bad$"):
         opened(saved(tmp_path, rows))
-    assert event_checks.WINDOW == 8
+    assert checks.WINDOW == 8
 
 
 def test_the_reported_reason_is_the_most_frequent_one(tmp_path: Path) -> None:
@@ -441,7 +441,7 @@ NUMBER = LINES[:MIDDLE].count("\n") + 1  # of the line that begins at MIDDLE
 def test_texts_are_read_as_programs_write_them(
     tmp_path: Path, content: str | bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("edslam_ti.datasets.event_text.CHUNK", 1000)
+    monkeypatch.setattr("edslam_ti.event_files.text.CHUNK", 1000)
     events = opened(text(tmp_path, content), is_text=True)
     assert_same(events.between(0, 1), some_events())
     assert (events.num_dropped, events.notes) == (0, ())
@@ -470,7 +470,7 @@ def test_a_last_line_that_is_cut_off_is_left_out(tmp_path: Path) -> None:
     "garbage", ["nan nan", "0.1 one 2 1", "1 2 3 4 5", "\x00\x01\x02", "0.1 3_1 2 1", "é"]
 )
 def test_a_line_of_garbage_is_left_out(tmp_path: Path, garbage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("edslam_ti.datasets.event_text.CHUNK", 1000)
+    monkeypatch.setattr("edslam_ti.event_files.text.CHUNK", 1000)
     content = "# with\n\n" + LINES[:MIDDLE] + garbage + "\n" + LINES[MIDDLE:]
     events = opened(text(tmp_path, content), is_text=True)
     assert_same(events.between(0, 1), some_events())

@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from edslam_ti.cache import cache_folder
-from edslam_ti.datasets.event_checks import BadRows, EventChecker, recognised_columns, sorted_by_time
-from edslam_ti.datasets.event_copy import (
+from edslam_ti.errors import DataError
+from edslam_ti.event_files.checks import EventChecker, bad_rows_note, recognised_columns, sorted_by_time
+from edslam_ti.event_files.copies import (
     BYTES_PER_EVENT,
     CopySummary,
     EventCopy,
     EventsInMemory,
     MappedEvents,
 )
-from edslam_ti.datasets.event_rows import BLOCK, NpyRows
-from edslam_ti.datasets.event_text import TextRows
-from edslam_ti.errors import DataError
+from edslam_ti.event_files.rows import BLOCK, NpyRows
+from edslam_ti.event_files.stream import Progress
+from edslam_ti.event_files.text import TextRows
 from edslam_ti.events import Events
 
 IN_MEMORY = 2_000_000  # rows; smaller arrays are checked each time, which takes a quarter of a second
@@ -28,8 +29,6 @@ SLOW = 50_000_000  # bytes; longer files show a bar while they are checked
 TYPICAL_LINE = 15  # bytes of a line of text with an event, to estimate how many there are
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[float], None]  # receives the share done, 0 to 1
 
 
 class EventFile:
@@ -56,6 +55,7 @@ class EventFile:
         Raises `DataError` for files without events, with too many bad rows, or with times in another unit.
         """
         self.path = path
+        self.size: tuple[int, int] | None = None  # neither arrays nor texts state it
         self.shift = 0.0
         size = (width, height)
         source = TextRows(path, size) if is_text else NpyRows(path)
@@ -142,7 +142,7 @@ def _checked(
         notes = list(source.notes) if isinstance(source, TextRows) else []
         if columns.order != source.columns:
             notes.append(f"columns look like {' '.join(columns.order)} and are read in that order")
-        notes += _bad_rows_note(checker.bad, checker.num_rows, source.counted)
+        notes += bad_rows_note(checker.bad, checker.num_rows, source.counted)
         dropped = checker.bad.number + (len(source.notes) if isinstance(source, TextRows) else 0)
         if num_events == 0:
             raise DataError(f"{source.name}: expected events, got none that is good")
@@ -173,13 +173,6 @@ def _checked(
                 return rows, summarised(rows.num_events)
         events = Events.concatenate(list(shown(update)))
     return EventsInMemory(events), summarised(len(events))
-
-
-def _bad_rows_note(bad: BadRows, num_rows: int, counted: str) -> list[str]:
-    if not bad.number:
-        return []
-    are = "are" if bad.number > 1 else "is"
-    return [f"{bad.number} of {num_rows} {counted}s {are} bad and left out, first {bad.first}"]
 
 
 @contextmanager
