@@ -1,8 +1,8 @@
 """edslam convert IN OUT
 
-Write the recording in the folder IN, of any layout, to the folder OUT in one of our own layouts. Events, stamps,
-depth, images and true poses are the same to the bit, so a run on OUT gives the same trajectory. A lens is
-undistorted on the way.
+Write the recording in the folder IN, of any layout, to the folder OUT in one of our own layouts. Events,
+stamps, depth, images and true poses are the same to the bit, so a run on OUT gives the same trajectory. A
+lens is undistorted on the way.
 
     edslam convert data/slider_depth data/slider                       the layout generic
     edslam convert data/slider_depth data/slider --layout event_replica
@@ -49,8 +49,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             sequence, options.out, options.layout, lambda share: bar.update(task, completed=share)
         )
     print(
-        f"{plain(written.folder, 4096)}: {written.num_events} events, {written.num_depth_images} depth images, "
-        f"{written.num_images} images"
+        f"{plain(written.folder, 4096)}: {written.num_events} events, "
+        f"{written.num_depth_images} depth images, {written.num_images} images"
     )
     for note in [*sequence.notes, *written.notes]:
         print(plain(note))

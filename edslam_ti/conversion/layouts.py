@@ -113,9 +113,7 @@ class GenericWriter:
         (self.folder / "images.txt").write_text("# stamp [s] path\n" + "".join(lines))
         return len(lines)
 
-    def _readable(
-        self, read: Callable[[int], np.ndarray], k: int, t: float, what: str
-    ) -> np.ndarray | None:
+    def _readable(self, read: Callable[[int], np.ndarray], k: int, t: float, what: str) -> np.ndarray | None:
         """Return an image, None with a note where it cannot be read."""
         try:
             return read(k)
@@ -237,9 +235,8 @@ LAYOUTS: dict[str, type[GenericWriter]] = {"generic": GenericWriter, "event_repl
 def _some_depth(sequence: EventDepthSequence) -> list[np.ndarray]:
     """Return a few readable depth images."""
     number = len(sequence.depth_timestamps)
-    indices = np.unique(np.linspace(0, number - 1, LOOKED_AT).astype(int)) if number else []
     found = []
-    for k in indices:
+    for k in np.unique(np.linspace(0, number - 1, LOOKED_AT).astype(int)) if number else ():
         try:
             found.append(sequence.depth(int(k)))
         except (DataError, OSError):

@@ -47,9 +47,7 @@ def _suggested(depth: np.ndarray) -> list[float]:  # [H, W] float32 m
     return [s for s in (float(f"{scale:.{digits}g}") for digits in (3, 5, 7)) if 1 <= s <= 1e6]
 
 
-def write_depth(
-    folder: Path, stem: str, depth: np.ndarray, scale: float | None
-) -> str:  # [H, W] float32 m
+def write_depth(folder: Path, stem: str, depth: np.ndarray, scale: float | None) -> str:  # [H, W] float32 m
     """Write a depth image in 1 / `scale` metres, else as float32 metres; return the file's name."""
     units = None if scale is None else depth_units(depth, scale)
     if units is None:
@@ -59,7 +57,7 @@ def write_depth(
 
 
 def write_grey(folder: Path, stem: str, image: np.ndarray) -> str:  # [H, W] float32 in [0, 1]
-    """Write a grey image with 8 bits where they hold it to the bit, else as float32; return the file's name."""
+    """Write a grey image as 8 bits where they hold it to the bit, else as float32; return its file's name."""
     levels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     if (levels.astype(np.float32) / 255 == image).all():
         return _write_png(folder / f"{stem}.png", levels)

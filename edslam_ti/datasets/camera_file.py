@@ -49,7 +49,7 @@ class CameraFile(BaseModel):
     frame_rate: float = Field(30.0, ge=1e-3, le=1e5)
     """Images per second, for layouts whose files have a number but no time (not EventReplica's)."""
     time_offset: float = Field(0.0, ge=-1e11, le=1e11)
-    """Seconds to add to every stamp of the files to get the recording's own clock (event_replica, generic)."""
+    """Seconds to add to every stamp of the files for the recording's own clock (event_replica, generic)."""
     preset: str | None = Field(None, pattern=r"^[a-z0-9_]{1,40}$")
     """Data set whose settings (configs/<preset>.yaml) fit the recording (event_replica, generic)."""
     description: str | None = None

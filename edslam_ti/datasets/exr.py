@@ -42,9 +42,7 @@ def read_exr(path: Path, camera: Camera, what: str = "depth") -> np.ndarray:  # 
                 return pixels
     if len(channels) == 1:
         return next(iter(channels.values()))
-    raise DataError(
-        f"{path}: expected a channel Z, V, Y or R with {what}, got {', '.join(sorted(channels))}"
-    )
+    raise DataError(f"{path}: expected a channel Z, V, Y or R with {what}, got {', '.join(sorted(channels))}")
 
 
 def write_exr(path: Path, image: np.ndarray, channel: str) -> None:  # [H, W] float32

@@ -1,7 +1,7 @@
 """The layout `generic`: our own, for any camera; docs/data.md describes it.
 
     camera.json           required; width, height, fx, fy, cx, cy and more, see camera_file.py
-    events.*              one file that `edslam_ti.event_files` reads (HDF5, npy, npz, text, RAW, bag, ...), or
+    events.*              one file that `edslam_ti.event_files` reads (HDF5, npy, text, ...), or
     events/{x,y,t,p}.npy  columns: pixel column and row, seconds (float64), polarity
     depth.txt             lines 'stamp path'; PNG of 16 bits in 1/depth_scale metres, or OpenEXR in metres
     images.txt            lines 'stamp path', optional; PNG, JPEG, or OpenEXR with brightness 0 to 1
@@ -54,12 +54,14 @@ class GenericSequence(EventDepthSequence):
         self.exposure, self.preset = calibration.exposure, calibration.preset
         self.contrast_threshold = calibration.contrast_threshold
         self._depth_format = calibration.depth_format()
-        self._events = self._open_events(folder)
+        self._events: EventStream | None = self._open_events(folder)
         depth_times, self._depth_files = _listed(folder / "depth.txt")
         image_times, self._image_files = _listed(folder / "images.txt")
         self.has_events = self._events is not None
         if self._events is None and len(depth_times) == 0:
-            raise DataError(f"{folder}: expected events (events.h5, events/x.npy, ...) or depth.txt, got neither")
+            raise DataError(
+                f"{folder}: expected events (events.h5, events/x.npy, ...) or depth.txt, got neither"
+            )
         first = self._events.time_range[0] if self._events is not None else float(depth_times[0])
         self._shift = clock_offset(first)
         self.time_offset = self._shift + calibration.time_offset

@@ -1,8 +1,8 @@
 """Reads the true views off the path that simulated recordings have, for evaluation only.
 
-    novel_views/images/frameNNNNNN.png     NNNNNN = milliseconds of the nearby pose on the path
-    novel_views/depth/frameNNNNNN.png      depth of the same views
-    novel_views/traj.txt                   camera-to-world pose of every view (16 numbers), in the files' order
+novel_views/images/frameNNNNNN.png     NNNNNN = milliseconds of the nearby pose on the path
+novel_views/depth/frameNNNNNN.png      depth of the same views
+novel_views/traj.txt                   T_world_camera of every view (16 numbers a line), in the files' order
 """
 
 from pathlib import Path
