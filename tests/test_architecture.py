@@ -32,6 +32,7 @@ RANKS: list[list[str]] = [
     ["tracking", "mapping"],
     ["slam", "baselines", "viewer"],
     ["methods", "results"],
+    ["inspection"],
     ["identity", "checkpoint", "pipeline", "command_line"],
     ["experiments"],
     ["commands"],
@@ -102,7 +103,16 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": ["config", "arguments", "checkpoint", "command_line", "simulation", "datasets"],
     "yaml": ["config"],
-    "scipy": ["trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"],
+    "scipy": [
+        "inspection",
+        "trajectory",
+        "truth",
+        "journal",
+        "simulation",
+        "evaluation",
+        "mapping",
+        "results",
+    ],
     "cv2": [
         *(
             "alignment",
@@ -110,6 +120,7 @@ LIBRARIES: dict[str, list[str]] = {
             "depth_images",
             "datasets",
             "conversion",
+            "inspection",
             "simulation",
             "event_images",
             "tracking",

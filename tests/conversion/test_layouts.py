@@ -1,4 +1,4 @@
-"""A converted recording holds what the original holds, to the bit; nothing that is not ours is overwritten."""
+"""A converted recording is its original to the bit; what is not ours is not overwritten."""
 
 from pathlib import Path
 
@@ -24,9 +24,8 @@ class Awkward(WrappedSequence):
         super().__init__(sequence)
         rng = np.random.default_rng(4)
         self.time_offset = 1.6e9
-        self.depth_timestamps = sequence.depth_timestamps + rng.uniform(
-            0, 1e-3, len(sequence.depth_timestamps)
-        )
+        stamps = sequence.depth_timestamps
+        self.depth_timestamps = stamps + rng.uniform(0, 1e-3, len(stamps))
         twists = rng.normal(0, 0.3, (9, 6))
         self.truth = Trajectory(np.linspace(0, 0.3, 9) / 3.0, np.array([se3_exp(t) for t in twists]))
         self.preset = "rpg"

@@ -1,0 +1,203 @@
+"""Everything that an inspection finds of a recording."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edslam_ti.config import Config, dataset_differences
+from edslam_ti.datasets import EventDepthSequence
+from edslam_ti.inspection.calibration import ShiftedDepth
+from edslam_ti.inspection.clock_offsets import Offset, clock_findings
+from edslam_ti.inspection.edge_check import EdgeCheck, check_edges
+from edslam_ti.inspection.event_volume import EventVolume, liveliest_part
+from edslam_ti.inspection.findings import Finding
+from edslam_ti.inspection.image_check import (
+    TRANSFORMS,
+    ImageCheck,
+    TransformedEvents,
+    check_images,
+)
+from edslam_ti.inspection.pose_check import TOLERANCE, PoseCheck, check_poses, fits_better
+from edslam_ti.inspection.streams import (
+    DepthFacts,
+    EventFacts,
+    depth_facts,
+    depth_findings,
+    event_facts,
+    event_findings,
+    truth_findings,
+)
+from edslam_ti.inspection.tracked import Tracked, track
+
+MOST_LOST = 0.1  # share of the frames
+CONTRADICTION = 12.0  # times the expected difference of poses; good recordings: up to 8.2
+SURE, SMALLEST_DELAY = 4.5, 0.008  # standard deviations, s
+RESOLVED = 0.5  # a delay explains a contradiction if at most this share of it remains without the delay
+STANDS_OUT, HIDDEN = 4.0, 1.7  # heights of a peak of depth edges in events: clear, and none
+# Faults with which tracking makes no sense.
+CERTAIN = ("swapped_axes", "mirrored_events", "frozen_depth", "no_depth", "one_polarity")
+LATE_TRACKER = 0.004  # s, bias of the tracker's delay, besides its own deviation
+
+Progress = Callable[[str], None]  # receives what is being looked at
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a recording is, and what looks wrong in it."""
+
+    sequence: EventDepthSequence
+    part: tuple[float, float]  # s, looked at closely
+    events: EventFacts | None
+    depth: DepthFacts | None
+    images: ImageCheck | None
+    poses: PoseCheck | None
+    edges: EdgeCheck | None
+    tracked: Tracked | None
+    findings: tuple[Finding, ...]
+
+
+def inspect(sequence: EventDepthSequence, config: Config, progress: Progress) -> Report:
+    """Return a report on a recording; Taichi must have been started."""
+    config = config.updated(dataset_differences(sequence.preset or sequence.dataset))
+    progress("counting events")
+    events, depth = event_facts(sequence), depth_facts(sequence)
+    findings = [] if events is None else event_findings(sequence, events)
+    findings += depth_findings(sequence, depth) + truth_findings(sequence)
+    part = liveliest_part(sequence)
+    images = edges = tracked = None
+    if sequence.has_events:
+        volume = EventVolume(sequence, *part)
+        progress("comparing events with images")
+        images = check_images(sequence, volume)
+        progress("comparing events with edges of depth")
+        edges = check_edges(sequence, volume)
+    progress("comparing depth with true poses")
+    poses = check_poses(sequence, *part)
+    for check in (images, poses):
+        findings += [] if check is None else check.findings
+    if any(f.fault == "one_polarity" for f in findings):  # it explains that images do not fit
+        findings = [f for f in findings if f.fault != "unrelated_images"]
+    is_certain = any(f.fault in CERTAIN for f in findings)
+    offsets = _offsets(images, poses)
+    if sequence.has_events and depth is not None and not is_certain:
+        progress("tracking")
+        tracked, found, delay = _track(sequence, part, config, images, poses, edges)
+        findings += found
+        offsets += delay
+        if not found and tracked is not None and poses is not None and poses.is_good:
+            findings += fits_better(sequence, tracked.trajectory, poses, *part)
+    if not any(f.fault in ("truth_elsewhere", "truth_convention") for f in findings):
+        findings += clock_findings(offsets)
+    return Report(sequence, part, events, depth, images, poses, edges, tracked, tuple(findings))
+
+
+def _offsets(images: ImageCheck | None, poses: PoseCheck | None) -> list[Offset]:
+    """Return the offsets that images and true poses give."""
+    offsets = []
+    if images is not None and images.is_good:
+        offsets.append(Offset("events", "images", images.offset, images.tolerance / 2))
+    if (
+        poses is not None
+        and poses.is_good
+        and SURE * poses.deviation < 2 * max(abs(poses.offset), 2 * TOLERANCE)
+    ):
+        offsets.append(Offset("depth", "truth", poses.offset, poses.deviation + TOLERANCE / 3))
+    return offsets
+
+
+def _track(
+    sequence: EventDepthSequence,
+    part: tuple[float, float],
+    config: Config,
+    images: ImageCheck | None,
+    poses: PoseCheck | None,
+    edges: EdgeCheck | None,
+) -> tuple[Tracked | None, list[Finding], list[Offset]]:
+    """Return the tracked path, what events and depth contradict each other in, and the delay of depth."""
+    tracked = track(sequence, *part, config)
+    if tracked is None:
+        return None, [], []
+    delay, first = 0.0, _misfit(tracked)
+    best = tracked
+    for _ in range(3):
+        step = _delay(best)
+        if step is None:
+            break
+        again = track(ShiftedDepth(sequence, delay + step), *part, config)
+        if again is None or _misfit(again) > _misfit(best):
+            break
+        delay, best = delay + step, again
+    misfit = _misfit(best)
+    if (misfit > CONTRADICTION and misfit > RESOLVED * first) or best.lost_share > MOST_LOST:
+        is_good = images is not None and images.is_good, poses is not None and poses.is_good
+        mirrored = _mirrored(sequence, part, config, best, *is_good)
+        return tracked, [mirrored or _contradiction(best, edges)], []
+    c = best.consistency
+    if c is None:
+        return tracked, [], []
+    return best, [], [Offset("depth", "events", delay, c.depth_delay_sigma_s + LATE_TRACKER)]
+
+
+def _misfit(tracked: Tracked) -> float:
+    """Return how much events and depth contradict each other, in expected differences of poses."""
+    if tracked.consistency is None:
+        return np.inf if tracked.lost_share > MOST_LOST else 0.0
+    return float(np.sqrt(tracked.consistency.disagreement))
+
+
+def _delay(tracked: Tracked) -> float | None:
+    """Return the delay of depth (s) that the tracker is sure of."""
+    c = tracked.consistency
+    if c is None or abs(c.depth_delay_s) < max(SURE * c.depth_delay_sigma_s, SMALLEST_DELAY / 2):
+        return None
+    return c.depth_delay_s
+
+
+def _start(tracked: Tracked) -> str:
+    how = f"{_misfit(tracked):.0f} times the expected difference of poses, 2 to 8 is usual"
+    if tracked.lost_share > MOST_LOST:
+        how = f"{tracked.lost_share:.0%} of the frames cannot be tracked"
+    return f"events and depth contradict each other ({how})"
+
+
+def _mirrored(
+    sequence: EventDepthSequence,
+    part: tuple[float, float],
+    config: Config,
+    tracked: Tracked,
+    is_like_images: bool,  # the events
+    is_like_truth: bool,  # depth
+) -> Finding | None:
+    """Return that events and depth agree once one of them is mirrored or transposed; None: they never do."""
+    for name, (fault, _) in TRANSFORMS.items():
+        other = track(TransformedEvents(sequence, name), *part, config)
+        if other is None or other.consistency is None or other.lost_share > MOST_LOST:
+            continue
+        if _misfit(other) < min(CONTRADICTION, RESOLVED * _misfit(tracked)):
+            what = "depth" if is_like_images else "the events" if is_like_truth else "the events, or of depth"
+            return Finding(
+                "mirrored_depth" if is_like_images else fault,
+                f"{_start(tracked)}, and agree ({_misfit(other):.0f} times) after this change: {name} of "
+                f"{what}",
+            )
+    return None
+
+
+def _contradiction(tracked: Tracked, edges: EdgeCheck | None) -> Finding:
+    """Return what kind of contradiction of events and depth the edges show."""
+    start = _start(tracked)
+    if edges is not None and edges.here < HIDDEN and edges.best > STANDS_OUT:
+        x, y = edges.displacement
+        return Finding(
+            "depth_elsewhere",
+            f"{start}, and edges of depth fit the events {x:+.0f}, {y:+.0f} pixels (x, y) away: depth "
+            "is of another camera: register it to the event camera with both calibrations "
+            "(docs/my_camera.md)",
+        )
+    return Finding(
+        "depth_elsewhere",
+        f"{start}: depth is of another camera or not registered to the event camera, the focal length or the "
+        "principal point is wrong, or one of the two is mirrored or of another recording: look at the last "
+        "picture of the sheet (docs/my_camera.md)",
+    )
