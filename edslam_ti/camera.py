@@ -11,6 +11,9 @@ SHORTEST_FOCAL, LONGEST_FOCAL = (
     1e-3,
     1e3,
 )  # longer sides; beyond any fisheye, any telescope
+FLATTEST_PIXEL = 5.0  # height over width or width over height; a sensor read out in every 4th row has 4
+USUAL_FLATNESS = 1.5  # beyond, it is said
+USUAL_CENTRE = 0.25  # of a side: the principal point is usually nearer to the middle
 FARTHEST_CENTRE = 10  # longer sides; cut-outs have their centre outside
 
 NEAREST = 0.05  # metres: points nearer than this do not count as in view
@@ -46,11 +49,34 @@ class Camera:
                 f"{self.height} pixels (a usual lens has half to twice the width), got fx = {self.fx:g}, "
                 f"fy = {self.fy:g}"
             )
+        if not 1 / FLATTEST_PIXEL <= self.fx / self.fy <= FLATTEST_PIXEL:
+            raise DataError(
+                f"camera: expected fx and fy of one lens, at most {FLATTEST_PIXEL:g} times each other, got "
+                f"fx = {self.fx:g}, fy = {self.fy:g}; state both, and the size and centre that go with them"
+            )
         if abs(self.cx) > FARTHEST_CENTRE * side or abs(self.cy) > FARTHEST_CENTRE * side:
             raise DataError(
                 f"camera: expected the principal point near the {self.width}x{self.height} image, got "
                 f"cx = {self.cx:g}, cy = {self.cy:g}"
             )
+
+    @property
+    def oddities(self) -> list[str]:
+        """One line for each value that is possible, but of no usual camera."""
+        lines = []
+        flatness = max(self.fx / self.fy, self.fy / self.fx)
+        if flatness > USUAL_FLATNESS:
+            lines.append(
+                f"camera: fx = {self.fx:g} and fy = {self.fy:g} mean pixels {flatness:.2g} times as long as "
+                "wide; check them"
+            )
+        for name, value, side in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
+            if abs(value / side - 0.5) > USUAL_CENTRE:
+                lines.append(
+                    f"camera: {name} = {value:g} is far from the middle of {side} pixels; is the image a "
+                    "part of another, or is the principal point wrong?"
+                )
+        return lines
 
     @property
     def shape(self) -> tuple[int, int]:

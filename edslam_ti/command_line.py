@@ -4,6 +4,7 @@ Settings come from, each overriding the one before: defaults, configs/<dataset>.
 --config FILE, flags. Every field of `Config` is a flag, `--stage.field VALUE` for nested ones.
 """
 
+import atexit
 import contextlib
 import os
 import signal
@@ -106,6 +107,10 @@ def parse_config(
 def launch(main: Callable[[], None]) -> None:
     """Run a command; errors that a user can fix print one line on stderr and no traceback."""
     try:
+        os.getcwd()
+    except OSError:  # libraries abort there
+        _exit(FAILED, "the current folder no longer exists; change to another one")
+    try:
         main()
     except UsageError as error:
         _exit(USAGE, f"{error} (--help lists the options)")
@@ -126,6 +131,8 @@ def launch(main: Callable[[], None]) -> None:
         )
     except KeyboardInterrupt:
         _exit(SIGNALLED + signal.SIGINT, "interrupted")
+    finally:  # everything is done: Ctrl-C while the libraries end would only print their tracebacks
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
 
 def _exit(code: int, message: str) -> NoReturn:

@@ -158,6 +158,9 @@ class MappingConfig(Stage):
     (Sec. IV-A)."""
     max_gaussians: int = Field(300_000, ge=1)
     """Largest number of Gaussians; beyond half of it, the fuller the map, the coarser the new ones."""
+    ply_harmonics: int = Field(0, ge=0, le=3)
+    """Degree of the spherical harmonics in map.ply. Those above 0 are zeros, which some viewers and
+    converters demand: with 3, a file is 3.6 times as large."""
     initial_size: float = Field(0.25, gt=0)
     """Standard deviation of a new Gaussian, as a share of the spacing of its neighbours."""
     initial_opacity: float = Field(0.95, gt=0, lt=1)
@@ -238,10 +241,14 @@ class Config(Stage):
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
     dataset: str | None = None
-    """Input format: event_replica, rpg, rgbd, builtin; omitted: detected from the files in the data
-    folder, else the built-in room."""
+    """Input format: event_replica, rpg, vector, dsec, tum_vie, mvsec, m3ed, evslam, rgbd, builtin; omitted:
+    detected from the files in the data folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
+    depth_dir: Path | None = None
+    """Folder with depth images to use instead of the recording's own, or where it has none (docs/data.md)."""
+    crop: bool = False
+    """Use the part of the recording that published evaluations use (vector)."""
     method: str = "ed_slam"
     """Method to run: a tracker and a mapper."""
     start: float = Field(0.0, ge=0)

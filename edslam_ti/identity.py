@@ -19,6 +19,7 @@ from edslam_ti.kernels import engine
 
 HARMLESS = {"checkpoint", "visualize", "out"}  # settings that change no result
 HASHED = 1 << 20  # bytes at either end of a large file
+SHARED = ("*.yaml", "*.json", "*calib*/*.yaml", "*calib*/*.txt")  # in the folder above
 TEXT = {".json", ".txt", ".yaml", ".yml", ".csv"}
 
 
@@ -71,15 +72,34 @@ def _inputs(config: Config) -> dict[str, str]:
     dataset, folder = find_sequence(config)
     if folder is None:
         return {f"{dataset} {config.scene}": __version__}
+    prints = _prints(folder)
+    if config.depth_dir is not None:
+        prints |= {f"depth folder {name}": value for name, value in _prints(config.depth_dir).items()}
+    for pattern in SHARED:  # calibration that several recordings share
+        for file in sorted(folder.resolve().parent.glob(pattern)):
+            if file.is_file():
+                prints[f"../{file.relative_to(folder.resolve().parent)}"] = _ends(file, file.stat().st_size)
+    return prints
+
+
+def _prints(folder: Path) -> dict[str, str]:
+    """Return a fingerprint of a folder's files."""
     prints: dict[str, str] = {}
-    for path, _, names in os.walk(folder, followlinks=True):
+    walked: set[str] = set()
+    for path, folders, names in os.walk(folder, followlinks=True):
+        if os.path.realpath(path) in walked:  # a link to a folder above would never end
+            folders.clear()
+            continue
+        walked.add(os.path.realpath(path))
+        folders.sort()
         images = hashlib.blake2b(digest_size=16)
         for name in sorted(names):
             file = Path(path) / name
             try:
                 status = file.stat()
                 facts = f"{status.st_size} bytes of {status.st_mtime_ns}"
-                if file.suffix.lower() in TEXT or status.st_size > HASHED:
+                is_read = file.suffix.lower() in TEXT or status.st_size > HASHED
+                if is_read and file.is_file():  # reading a pipe or a device would never end
                     prints[str(file.relative_to(folder))] = f"{facts} {_ends(file, status.st_size)}"
                 else:
                     images.update(os.fsencode(f"{name} {facts}\n"))

@@ -25,9 +25,10 @@ class Table:
     lines: np.ndarray  # [N] int, the line of each in the file, from 1
 
 
-def read_table(path: Path, columns: int, line: str) -> Table:
+def read_table(path: Path, columns: int, line: str, header_lines: int = 0) -> Table:
     """Return the table in a text file of `columns` numbers a line; `line` describes one in messages.
 
+    Of the first `header_lines` lines, those that hold words are skipped, even if they are no comments.
     Raises `FileNotFoundError`, and `DataError` for a file without rows, a line of other than `columns`
     numbers, and numbers that are not finite.
     """
@@ -35,6 +36,8 @@ def read_table(path: Path, columns: int, line: str) -> Table:
     lines: list[int] = []
     for number, text in text_lines(path, f"expected lines '{line}'"):
         fields = text.split()
+        if number <= header_lines and not any(_is_number(field) for field in fields):
+            continue
         where = f"{path}: line {number}: expected {columns} numbers a line '{line}'"
         if "," in text:
             raise DataError(f"{where} with blanks between them, got commas: '{plain(text, 60)}'")
@@ -70,6 +73,14 @@ def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
         text = text.split("#", 1)[0].strip()
         if text:
             yield number, text
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
 
 
 def _number(field: str, where: str) -> float:

@@ -167,15 +167,16 @@ def write_tum(trajectory: Trajectory, path: Path, time_offset: float = 0.0) -> N
             file.write(f"{stamp:.9f} " + " ".join(f"{v:.9f}" for v in [*T[:3, 3], *q]) + "\n")
 
 
-def read_tum(path: Path, notes: list[str] | None = None) -> Trajectory:
+def read_tum(path: Path, notes: list[str] | None = None, header_lines: int = 0) -> Trajectory:
     """Read a TUM trajectory, lines `t tx ty tz qx qy qz qw`; '#' begins a comment.
 
+    Of the first `header_lines` lines, those that hold words are skipped.
     A line for each repair by `in_order` is appended to `notes`; without such a list it goes to the log.
     Raises `FileNotFoundError` or `DataError`.
     """
     if not path.is_file():
         raise FileNotFoundError(plain(f"{path} not found", LONGEST_MESSAGE))
-    table = read_table(path, 8, "t tx ty tz qx qy qz qw")
+    table = read_table(path, 8, "t tx ty tz qx qy qz qw", header_lines)
     rows, lines = table.rows, table.lines
     norms = np.linalg.norm(rows[:, 4:], axis=1)
     odd = (norms < SHORTEST_QUATERNION) | (norms > LONGEST_QUATERNION)

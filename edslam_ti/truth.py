@@ -241,9 +241,11 @@ class _Limit:
         hardest: float,  # m/s^2 or rad/s^2
     ) -> None:
         surprise, length = _surprise(moved, steps), np.linalg.norm(moved, axis=1)
-        usual = UNUSUAL * float(np.percentile(surprise / steps**2, 90))
+        # A pose elsewhere makes up to three steps unusual: they must not define what is usual.
+        usually = max(0.0, min(NEARLY_ALL, 100 * (1 - 3 / len(steps))))
+        usual = UNUSUAL * float(np.percentile(surprise / steps**2, usually))
         self._smallest, self._acceleration = smallest, max(hardest, 2 * usual)
-        fastest = FASTER * float(np.percentile(length / steps, 90))
+        fastest = FASTER * float(np.percentile(length / steps, usually))
         # Two successive turns by 180 degrees do not differ, but are too fast.
         self.is_passed = (surprise > self.at(steps)) | (length > fastest * steps + self.at(steps))  # [S] bool
 

@@ -106,3 +106,25 @@ def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
 def test_downscaling_to_nothing_is_refused() -> None:
     with pytest.raises(DataError, match="expected a size of 1 to"):
         CAMERA.downscaled(16)
+
+
+def test_pixels_of_no_sensor_are_refused() -> None:
+    with pytest.raises(DataError, match="fx and fy of one lens"):
+        Camera(96, 64, 48.0, 1.5, 48.0, 32.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ((48.0, 48.0, 47.5, 31.5), []),
+        ((48.0, 24.0, 47.5, 31.5), ["fx = 48 and fy = 24 mean pixels 2 times"]),
+        ((48.0, 48.0, 1.5, 31.5), ["cx = 1.5 is far from the middle of 96"]),
+        ((48.0, 48.0, 47.5, 60.0), ["cy = 60 is far from the middle of 64"]),
+    ],
+)
+def test_values_of_no_usual_camera_are_said(
+    values: tuple[float, float, float, float], words: list[str]
+) -> None:
+    lines = Camera(96, 64, *values).oddities
+    assert len(lines) == len(words)
+    assert all(word in line for word, line in zip(words, lines))

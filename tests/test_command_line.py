@@ -316,3 +316,23 @@ def test_a_bare_switch_is_true() -> None:
     config = parse_config(["--visualize", "--mapping.enabled", "false", "--scene", "room0"])
     assert config.visualize
     assert not config.mapping.enabled
+
+
+def test_ctrl_c_while_the_libraries_end_is_ignored() -> None:
+    code = (
+        "import atexit, os, signal\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "from edslam_ti.command_line import launch\n"
+        "launch(lambda: None)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_current_folder_that_is_gone_is_said(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    code = f"import os; os.rmdir({str(gone)!r}); from edslam_ti.command_line import launch; launch(print)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=gone, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("error: the current folder no longer exists")

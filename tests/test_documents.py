@@ -41,7 +41,11 @@ from edslam_ti.pipeline import run
 from edslam_ti.slam import Slam
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs/datasets").glob("*.md")]),
+]
 SOURCES = {
     str(path.relative_to(ROOT)): path
     for folder in ("kernels", "edslam_ti", "apps")

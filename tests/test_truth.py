@@ -116,6 +116,17 @@ def test_pose_that_jumps_away_is_left_out(rate: float, distance: float) -> None:
     assert np.flatnonzero(is_jump).tolist() == [20]
 
 
+@pytest.mark.parametrize("count", [7, 9, 15])
+@pytest.mark.parametrize("distance", [1.0, 100.0])
+def test_pose_that_jumps_away_from_a_short_path_is_left_out(count: int, distance: float) -> None:
+    path = hand_held(20.0)
+    poses = path.poses[:count].copy()
+    poses[count // 2, 0, 3] += distance
+    is_jump = impossible_poses(Trajectory(path.timestamps[:count], poses))
+    assert np.flatnonzero(is_jump).tolist() == [count // 2]
+    assert not impossible_poses(Trajectory(path.timestamps[:count], path.poses[:count])).any()
+
+
 def test_several_poses_elsewhere_and_a_flipped_one_are_left_out() -> None:
     path = hand_held(120.0)
     poses = path.poses

@@ -21,7 +21,7 @@ from edslam_ti.output import atomic_folder, check_replaceable
 TITLE = "Converted recording"  # how README.txt begins
 FILES = (
     *("README.txt", "camera.json", "depth.txt", "images.txt", "poses_ts.txt", "traj.txt", "surfaces.ply"),
-    *("imu.csv", "depth/timestamps.txt", "images/timestamps.txt", "Depth_exr/timestamps.txt"),
+    *("imu.txt", "depth/timestamps.txt", "images/timestamps.txt", "Depth_exr/timestamps.txt"),
     *("novel_views/traj.txt", "events/x.npy", "events/y.npy", "events/t.npy", "events/p.npy"),
 )
 PICTURES = ("depth", "images", "Depth_exr", "novel_views/depth", "novel_views/images")
@@ -72,6 +72,7 @@ class GenericWriter:
         num_depth = self._write_depth(lambda s: progress(SHARES[0] + (SHARES[1] - SHARES[0]) * s))
         num_images = self._write_images(lambda s: progress(SHARES[1] + (1 - SHARES[1]) * s))
         self._write_truth()
+        self._write_imu()
         self._write_descriptions()
         progress(1.0)
         return num_events, num_depth, num_images
@@ -133,6 +134,14 @@ class GenericWriter:
             shutil.copyfile(sequence.surfaces_file, folder / "surfaces.ply")
         self._write_novel_views()
 
+    def _write_imu(self) -> None:
+        imu = self.sequence.imu
+        if imu is None:
+            return
+        rows = np.concatenate([imu.timestamps[:, None], imu.angular_velocity, imu.acceleration], 1)
+        lines = (" ".join(repr(float(v)) for v in row) + "\n" for row in rows)
+        (self.folder / "imu.txt").write_text("# t gx gy gz ax ay az, s, rad/s, m/s^2\n" + "".join(lines))
+
     def _write_novel_views(self) -> None:
         views = self.sequence.novel_views()
         if not views:
@@ -188,6 +197,10 @@ class EventReplicaWriter(GenericWriter):
                     f"{sequence.scene}: the layout event_replica needs {what}, and this recording has none; "
                     "convert it to generic"
                 )
+
+    def _write_imu(self) -> None:
+        if self.sequence.imu is not None:
+            self.notes.append("inertial measurements are left out: event_replica has no place for them")
 
     def _write_events(self, progress: Progress) -> int:
         threshold = self.sequence.contrast_threshold

@@ -20,10 +20,17 @@ from typing import NamedTuple
 from edslam_ti.config import Config
 from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence, WrappedSequence
 from edslam_ti.datasets.camera_file import read_camera
+from edslam_ti.datasets.dsec import DsecSequence, is_dsec
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
+from edslam_ti.datasets.evslam import EvslamSequence, is_evslam
 from edslam_ti.datasets.generic import GenericSequence, is_generic
+from edslam_ti.datasets.m3ed import M3edSequence, is_m3ed
+from edslam_ti.datasets.mvsec import MvsecSequence, is_mvsec
+from edslam_ti.datasets.other_depth import OtherDepth
 from edslam_ti.datasets.rgbd import RgbdSequence, is_rgbd
 from edslam_ti.datasets.rpg import RpgSequence, is_rpg
+from edslam_ti.datasets.tum_vie import TumVieSequence, is_tum_vie
+from edslam_ti.datasets.vector import VectorSequence, is_vector
 from edslam_ti.errors import ConfigError, plain
 
 __all__ = [
@@ -83,7 +90,11 @@ FORMATS: dict[str, Format] = {
     "event_replica": Format(
         "EventReplica's layout, with event_threshold_<C>/gray_events_data.npy",
         lambda folder, config: EventReplicaSequence(
-            folder, config.contrast_threshold, config.depth_rate, config.image_rate
+            folder,
+            config.contrast_threshold,
+            config.depth_rate,
+            config.image_rate,
+            config.depth_dir is None,
         ),
         is_event_replica,
     ),
@@ -94,8 +105,38 @@ FORMATS: dict[str, Format] = {
     ),
     "rpg": Format(
         "RPG Event Camera Dataset's layout, with events.txt",
-        lambda folder, config: RpgSequence(folder),
+        lambda folder, config: RpgSequence(folder, config.depth_dir is None),
         is_rpg,
+    ),
+    "vector": Format(
+        "VECtor benchmark's layout, with <name>.synced.left_event.hdf5",
+        lambda folder, config: VectorSequence(folder, config.crop, config.depth_dir is None),
+        is_vector,
+    ),
+    "dsec": Format(
+        "DSEC's layout, with events/left/events.h5",
+        lambda folder, config: DsecSequence(folder, config.depth_dir is None),
+        is_dsec,
+    ),
+    "tum_vie": Format(
+        "TUM-VIE's layout, with <name>-events_left.h5",
+        lambda folder, config: TumVieSequence(folder, config.depth_dir is None),
+        is_tum_vie,
+    ),
+    "mvsec": Format(
+        "MVSEC's layout, with <name>_data.hdf5",
+        lambda folder, config: MvsecSequence(folder, config.depth_dir is None),
+        is_mvsec,
+    ),
+    "m3ed": Format(
+        "M3ED's layout, with <name>_data.h5",
+        lambda folder, config: M3edSequence(folder, config.depth_dir is None),
+        is_m3ed,
+    ),
+    "evslam": Format(
+        "EvSLAM's layout, with <name>.bag and calib_results_cam.txt",
+        lambda folder, config: EvslamSequence(folder, config.depth_dir is None),
+        is_evslam,
     ),
     "rgbd": Format(
         "layouts of TUM RGB-D, of NICE-SLAM's Replica and of 7-Scenes, without events",
@@ -161,7 +202,10 @@ def open_sequence(config: Config) -> EventDepthSequence:
     if folder is None:
         assert format.make is not None, f"{found.dataset}: has scenes but no way to make them"
         folder = format.make(config.scene)
-    return format.open(folder, config)
+    sequence = format.open(folder, config)
+    if config.crop and found.dataset != "vector":
+        raise ConfigError(f"crop: expected with vector alone, got it with {found.dataset}; leave it out")
+    return sequence if config.depth_dir is None else OtherDepth(sequence, config.depth_dir)
 
 
 def open_folder(folder: Path, config: Config) -> EventDepthSequence:

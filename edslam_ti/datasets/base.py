@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.datasets.imu import ImuData
 from edslam_ti.errors import LONGEST_MESSAGE, DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.trajectory import Trajectory
@@ -66,6 +67,7 @@ class EventDepthSequence(ABC):
     has_events: bool = True
     num_dropped_events: int = 0  # bad rows of the event file, which were left out
     time_offset: float = 0.0  # seconds to add to get the files' own clock (stamps since the epoch or boot)
+    imu: ImuData | None = None  # inertial measurements; nothing uses them yet
     depth_varies: bool = False  # depth images usually show several values: one with a single value is broken
 
     @cached_property

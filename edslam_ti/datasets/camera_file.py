@@ -17,8 +17,9 @@ from edslam_ti.camera import LARGEST_SIDE, Camera
 from edslam_ti.datasets.depth import DepthFormat
 from edslam_ti.datasets.files import file_bytes
 from edslam_ti.errors import DataError, plain, shown
+from edslam_ti.lenses import MODELS, Lens, model_name
 
-DISTORTION_KEYS = ("distortion", "distortion_coefficients", "dist", "k1", "k2", "k3", "p1", "p2")
+DISTORTION_LISTS = ("distortion", "distortion_coefficients", "dist")  # names of the same key
 LONGEST_KEY = 40  # characters; longer keys are not compared with the fields' names
 
 
@@ -52,6 +53,22 @@ class CameraFile(BaseModel):
     """Seconds to add to every stamp of the files for the recording's own clock (event_replica, generic)."""
     preset: str | None = Field(None, pattern=r"^[a-z0-9_]{1,40}$")
     """Data set whose settings (configs/<preset>.yaml) fit the recording (event_replica, generic)."""
+    distortion_model: str = Field("plumb_bob", max_length=40)
+    """plumb_bob (k1 k2 p1 p2 k3), rational (also k4 k5 k6) or equidistant (k1 k2 k3 k4), OpenCV's."""
+    distortion: list[float] = Field([], max_length=8)
+    """Its coefficients in OpenCV's order; or one by one, below."""
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    depth_undistorted: bool = False
+    """Depth images are undistorted already, in the pinhole camera without the distortion."""
+    T_events_depth: list[float] | None = Field(None, min_length=16, max_length=16)
+    """In a folder of depth images (--depth-dir): from the depth camera to the event camera, row by row."""
     description: str | None = None
     """One line about the recording, repeated in results, cut if long; a simulated one must say that it is."""
 
@@ -60,6 +77,18 @@ class CameraFile(BaseModel):
         """The pinhole camera with pixel centres at integers."""
         shift = 0.5 if self.pixel_centres == "half" else 0.0
         return Camera(self.width, self.height, self.fx, self.fy, self.cx - shift, self.cy - shift)
+
+    @property
+    def lens(self) -> Lens:
+        """The camera with its distortion."""
+        model = model_name(self.distortion_model)
+        given = self.distortion
+        if not given:
+            names = MODELS[model][0].split()
+            given = [getattr(self, name) for name in names]
+        if model == "plumb_bob" and len(given) == 8:
+            model = "rational"
+        return Lens(self.camera, model, tuple(float(v) for v in given))
 
     @property
     def metres_per_unit(self) -> float:
@@ -79,9 +108,14 @@ def read_camera(path: Path) -> CameraFile:
     values = read_json(path)
     if not isinstance(values, dict):
         raise DataError(f'{path}: expected an object {{"width": 768, ...}}, got {type(values).__name__}')
-    for key, value in values.items():
-        if key not in CameraFile.model_fields and len(key) <= LONGEST_KEY:
-            _check_key(path, key, value)
+    for key in values:
+        if key not in CameraFile.model_fields and len(key) <= LONGEST_KEY and key not in DISTORTION_LISTS:
+            _check_key(path, key)
+    for key in DISTORTION_LISTS[1:]:
+        if key in values and "distortion" not in values:
+            values["distortion"] = values.pop(key)
+    if isinstance(values.get("distortion"), list) and not np.any(np.array(values["distortion"], object) != 0):
+        values.pop("distortion")  # zeros, whatever their number
     if isinstance(values.get("description"), str):
         values["description"] = plain(values["description"])
     try:
@@ -89,7 +123,7 @@ def read_camera(path: Path) -> CameraFile:
             {k: int(v) if isinstance(v, float) and v.is_integer() and k in ("width", "height") else v
              for k, v in values.items() if k in CameraFile.model_fields}
         )  # fmt: skip
-        result.camera  # noqa: B018  its own checks
+        result.lens  # noqa: B018  its own checks
     except ValidationError as error:
         problem = error.errors()[0]
         name = ".".join(str(part) for part in problem["loc"])
@@ -126,10 +160,8 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _check_key(path: Path, key: str, value: object) -> None:
-    """Refuse an unknown key that looks like a misspelt field, and any distortion except zero."""
+def _check_key(path: Path, key: str) -> None:
+    """Refuse an unknown key that looks like a misspelt field."""
     close = difflib.get_close_matches(key.lower(), CameraFile.model_fields, n=1, cutoff=0.8)
     if close:
         raise DataError(f"{path}: unknown key '{plain(key)}'; did you mean '{close[0]}'?")
-    if key.lower() in DISTORTION_KEYS and value and np.any(np.asarray(value, object) != 0):
-        raise DataError(f"{path}: '{key}': expected an undistorted camera; undistort the data first")

@@ -61,10 +61,14 @@ def read_depth(path: Path, camera: Camera, format: DepthFormat) -> np.ndarray:  
 def look_at_images(sequence: EventDepthSequence, folder: Path) -> None:
     """Read a few depth and grey images of a sequence that is being opened; set its `depth_varies`.
 
+    Values of no usual camera are noted.
+
     Raises `DataError` if most of them cannot be read, or if (nearly) all depth images show the same single
     value or none: the sensor was covered or saturated, or the images are no depth. Images that show one value
     each, but different ones, are accepted: they may show a flat wall seen at right angles.
     """
+    for line in sequence.camera.oddities:
+        sequence.note(line)
     _read_some(len(sequence.image_timestamps), sequence.image, "grey images")
     depths = _read_some(len(sequence.depth_timestamps), sequence.depth, "depth images")
     flat = [float(depth.max()) for depth in depths if not has_variation(depth)]  # m, 0: nothing measured

@@ -18,11 +18,14 @@ after 0, or after the first event if the events' clock does not start with the r
 
 camera.json: see camera_file.py; for missing fields EventReplica's own camera applies. With centres at "half"
 (EventReplica's, as cx = width / 2 shows) the first pixel is centred at (0.5, 0.5); the sequence's `camera`
-has centres at integers. Depth: depth.py says which values count as missing.
+has centres at integers. A camera with distortion (k1, k2, ... or `distortion` with `distortion_model`) is
+undistorted with unchanged focal lengths: events, images, and depth unless `depth_undistorted`. Depth:
+depth.py says which values count as missing.
 
 Clock: the files' own, in seconds; a late one is shifted (clocks.py), and `time_offset` holds the shift.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +41,7 @@ from edslam_ti.datasets.truth import read_timed_poses
 from edslam_ti.errors import DataError, plain
 from edslam_ti.event_files.checked import EventFile
 from edslam_ti.events import Events
+from edslam_ti.lenses import Undistortion
 from edslam_ti.trajectory import Trajectory
 
 EVENTS = "gray_events_data.npy"
@@ -58,6 +62,7 @@ class EventReplicaSequence(EventDepthSequence):
         contrast_threshold: float | None = None,
         depth_rate: float | None = None,  # Hz; depth images are numbered by index
         image_rate: float | None = None,  # Hz; so are grey images
+        needs_depth: bool = True,
     ) -> None:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: sequence folder not found")
@@ -68,6 +73,12 @@ class EventReplicaSequence(EventDepthSequence):
         calibration = read_camera(folder / "camera.json")
         self.description = calibration.description or f"EventReplica layout, {plain(folder)}"
         self.camera = calibration.camera
+        lens = calibration.lens
+        try:
+            self._undistortion = Undistortion(lens) if lens.is_distorted else None
+        except DataError as error:
+            raise DataError(f"{folder / 'camera.json'}: {error}") from error
+        self._depth_is_undistorted = calibration.depth_undistorted
         self.exposure, self.preset = calibration.exposure, calibration.preset
         self._depth_format = calibration.depth_format()
         events_folder, self.contrast_threshold = _event_folder(
@@ -83,7 +94,7 @@ class EventReplicaSequence(EventDepthSequence):
         if self._shift:
             self._events = self._events.shifted(self._shift)
 
-        self._read_images(calibration, depth_rate, image_rate)
+        self._read_images(calibration, depth_rate, image_rate, needs_depth)
         self.truth = self._read_truth(folder)
         if self.truth is not None:
             check_clock(self, folder, "poses_ts.txt", self.truth.timestamps)
@@ -94,19 +105,36 @@ class EventReplicaSequence(EventDepthSequence):
         return self._events.time_range
 
     def events(self, start: float, end: float) -> Events:
-        return self._events.between(start, end)
+        events = self._events.between(start, end)
+        return events if self._undistortion is None else self._undistortion.events(events)
 
     def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
-        return read_depth(self._depth_files[index], self.camera, self._depth_format)
+        return self._undistorted_depth(read_depth(self._depth_files[index], self.camera, self._depth_format))
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
-        return read_grey(self._image_files[index], self.camera)
+        return self._undistorted_image(read_grey(self._image_files[index], self.camera))
+
+    def _undistorted_image(self, image: np.ndarray) -> np.ndarray:  # [H, W]
+        return image if self._undistortion is None else self._undistortion.image(image)
+
+    def _undistorted_depth(self, depth: np.ndarray) -> np.ndarray:  # [H, W] m
+        if self._undistortion is None or self._depth_is_undistorted:
+            return depth
+        return self._undistortion.depth(depth)
 
     def novel_views(self) -> list[NovelView]:
-        return read_novel_views(self._folder, self.camera, self._depth_format, self._shift)
+        views = read_novel_views(self._folder, self.camera, self._depth_format, self._shift)
+        return [
+            replace(v, image=self._undistorted_image(v.image), depth=self._undistorted_depth(v.depth))
+            for v in views
+        ]
 
     def _read_images(
-        self, calibration: CameraFile, depth_rate: float | None, image_rate: float | None
+        self,
+        calibration: CameraFile,
+        depth_rate: float | None,
+        image_rate: float | None,
+        needs_depth: bool,
     ) -> None:
         """Find depth and grey images and their times."""
         depth_folder = self._folder / "depth"
@@ -114,14 +142,15 @@ class EventReplicaSequence(EventDepthSequence):
         if not depth:
             depth_folder = self._folder / "Depth_exr"
             depth = numbered_files(depth_folder, "*", (".exr",))
-        if not depth:
+        if not depth and needs_depth:
             raise DataError(
                 f"{self._folder}: no depth found; expected depth/frameNNNNNN.png (16 bits) or "
                 "Depth_exr/*.exr with NNNNNN in milliseconds (EventReplica ships none: render at its poses)"
             )
         rate = depth_rate or calibration.depth_rate
         self._depth_files, self.depth_timestamps = self._with_times(depth_folder, depth, rate, "depth_rate")
-        note_coverage(self)
+        if depth:
+            note_coverage(self)
         image_folder = self._folder / "images"
         images = numbered_files(image_folder, "frame*", (".jpg", ".jpeg", ".png", ".exr"))
         image_rate = image_rate or calibration.image_rate

@@ -1,5 +1,6 @@
 """Reads the small files of a recording: lists of times, images, numbered names."""
 
+import itertools
 import os
 import re
 import threading
@@ -20,9 +21,11 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 STDERR = 2  # file descriptor
 
 
-def read_numbers(path: Path, columns: int, line: str) -> np.ndarray:  # [N, columns] float64
+def read_numbers(
+    path: Path, columns: int, line: str, header_lines: int = 0
+) -> np.ndarray:  # [N, columns] float64
     """Return the table in a text file of `columns` numbers a line; `line` describes one in messages."""
-    return read_table(path, columns, line).rows
+    return read_table(path, columns, line, header_lines).rows
 
 
 def read_timed_paths(path: Path, use: str = "seconds") -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
@@ -94,6 +97,38 @@ def numbered_files(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dic
             raise DataError(f"{folder}: {found[key].name} and {path.name} both carry number {key}; keep one")
         found[key] = path
     return dict(sorted(found.items()))
+
+
+def timed_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[np.ndarray, list[Path]]:  # [I] s, I files
+    """Return the files of a folder whose names are times, and these, in ascending order.
+
+    A name with a decimal point is in seconds. A whole number is in the unit that makes it a time since the
+    epoch (seconds, ms, us or ns), else in microseconds.
+    """
+    found: list[tuple[float, Path]] = []
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.suffix.lower() not in suffixes or path.name[0] == ".":
+            continue
+        if not re.fullmatch(r"\d{1,20}(\.\d*)?", path.stem):
+            raise DataError(
+                f"{path}: expected a time as the file's name, as in 1642689268.899930{path.suffix}"
+            )
+        found.append((_time_of(path.stem), path))
+    found.sort()
+    for (before, _), (time, path) in itertools.pairwise(found):
+        if time <= before:
+            raise DataError(f"{path}: expected a time for each image, got {time:.9f} s twice; keep one")
+    return np.array([time for time, _ in found]), [path for _, path in found]
+
+
+def _time_of(text: str) -> float:  # s
+    value = float(text)
+    if "." in text:
+        return value
+    for ticks in (1.0, 1e3, 1e6, 1e9):
+        if 5e8 <= value / ticks < 5e9:  # the years 1985 to 2128
+            return value / ticks
+    return value / 1e6
 
 
 def read_image(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32 in [0, 1]

@@ -32,7 +32,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from edslam_ti.camera import Camera
@@ -51,6 +50,7 @@ from edslam_ti.datasets.truth import MATRIX, check_rigid, read_poses
 from edslam_ti.errors import DataError, plain
 from edslam_ti.events import Events
 from edslam_ti.geometry import orthonormalized
+from edslam_ti.lenses import Lens, Undistortion
 from edslam_ti.trajectory import Trajectory, read_tum
 
 MAX_DIFFERENCE = 0.02  # s between depth and its colour image (associate.py of the TUM benchmark)
@@ -76,7 +76,7 @@ class _Recording:
     image_times: np.ndarray  # [I] s, strictly increasing
     truth: Trajectory | None
     notes: tuple[str, ...] = ()  # repairs of the files
-    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 of images and depth; none: undistorted
+    lens: Lens | None = None  # of images and depth; None: undistorted
 
 
 class RgbdSequence(EventDepthSequence):
@@ -107,7 +107,9 @@ class RgbdSequence(EventDepthSequence):
         if recording.truth is not None:
             self.truth = Trajectory(recording.truth.timestamps - self.time_offset, recording.truth.poses)
             check_clock(self, folder, "the file of poses", self.truth.timestamps)
-        self._maps = _undistortion(self.camera, recording.distortion)
+        self._undistortion = None
+        if recording.lens is not None and recording.lens.is_distorted:
+            self._undistortion = Undistortion(recording.lens)
         look_at_images(self, folder)  # find faults now, not in the middle of a run
 
     @property
@@ -119,28 +121,16 @@ class RgbdSequence(EventDepthSequence):
 
     def depth(self, index: int) -> np.ndarray:  # [H, W] float32 metres, 0 = missing
         depth = read_depth(self._depth_files[index], self.camera, self._depth_format)
-        if self._maps is None:
-            return depth
-        return np.asarray(cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST))
+        return depth if self._undistortion is None else self._undistortion.depth(depth)
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
         image = read_image(self._image_files[index], self.camera)
-        if self._maps is None:
-            return image
-        return np.asarray(cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR))
+        return image if self._undistortion is None else self._undistortion.image(image)
 
 
 def is_rgbd(folder: Path) -> bool:
     """Return whether a folder holds depth images where one of the layouts has them."""
     return any(layout.detect(folder) for layout in LAYOUTS.values())
-
-
-def _undistortion(camera: Camera, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray] | None:
-    if not any(distortion):
-        return None
-    K, size = camera.matrix, (camera.width, camera.height)
-    u, v = cv2.initUndistortRectifyMap(K, np.array(distortion), np.eye(3), K, size, cv2.CV_32FC1)
-    return u, v
 
 
 # --- TUM RGB-D ---
@@ -162,14 +152,12 @@ def _read_tum(folder: Path) -> _Recording:
         )
     stated = read_camera(folder / "camera.json")
     camera = _stated_camera(folder, stated)
-    distortion: tuple[float, ...] = ()
-    if camera is None:
-        camera, distortion = _freiburg_camera(folder)
+    lens = _stated_lens(camera, stated) if camera is not None else _freiburg_lens(folder)
     notes: list[str] = []
     truth_file = folder / "groundtruth.txt"
     truth = read_tum(truth_file, notes) if truth_file.is_file() else None
     return _Recording(
-        camera,
+        lens.pinhole,
         stated.depth_format(TUM_SCALE),
         depth_files,
         depth_times,
@@ -177,7 +165,7 @@ def _read_tum(folder: Path) -> _Recording:
         depth_times[list(partners)],
         truth,
         tuple(notes),
-        distortion,
+        lens,
     )
 
 
@@ -201,8 +189,8 @@ def associated(
     return dict(sorted(partners.items()))
 
 
-def _freiburg_camera(folder: Path) -> tuple[Camera, tuple[float, ...]]:
-    """Return the published camera of a TUM sequence, identified by its name, and its distortion."""
+def _freiburg_lens(folder: Path) -> Lens:
+    """Return the published camera of a TUM sequence, identified by its name."""
     name = re.search(r"f(?:reiburg|r)([123])(?!\d)", folder.resolve().name)
     if name is None:
         raise DataError(
@@ -210,7 +198,7 @@ def _freiburg_camera(folder: Path) -> tuple[Camera, tuple[float, ...]]:
             f"folder's name, or camera.json with {', '.join(INTRINSICS)}"
         )
     intrinsics, distortion = FREIBURG[name[1]]
-    return Camera(640, 480, *intrinsics), distortion
+    return Lens(Camera(640, 480, *intrinsics), "plumb_bob", distortion)
 
 
 # --- Replica as NICE-SLAM rendered it ---
@@ -244,6 +232,7 @@ def _read_replica(folder: Path) -> _Recording:
         *_with_times(depth, stated),
         *_with_times(images, stated),
         truth,
+        lens=_stated_lens(camera, stated),
     )
 
 
@@ -297,6 +286,7 @@ def _read_frames(folder: Path) -> _Recording:
         *_with_times(depth, stated),
         *_with_times(images, stated),
         truth,
+        lens=_stated_lens(camera, stated),
     )
 
 
@@ -332,6 +322,11 @@ def _stated_camera(folder: Path, stated: CameraFile) -> Camera | None:
     if "pixel_centres" in stated.model_fields_set:
         return stated.camera
     return Camera(*(getattr(stated, name) for name in INTRINSICS))
+
+
+def _stated_lens(camera: Camera, stated: CameraFile) -> Lens:
+    """Return a camera with the distortion that camera.json states, usually none."""
+    return Lens(camera, stated.lens.model, stated.lens.coefficients)
 
 
 def _numbered(folder: Path, pattern: str, suffixes: tuple[str, ...]) -> dict[int, Path]:

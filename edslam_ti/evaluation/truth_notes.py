@@ -3,6 +3,8 @@
 It corrects nothing: a line names a possible cause of an error, and the error that would remain without it.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from edslam_ti.evaluation.conventions import apart, ate_cm, better_reading, rpe_cm_and_deg
@@ -27,11 +29,16 @@ NUM_SHIFTS = 101
 
 
 def truth_notes(
-    estimate: Trajectory, truth: Trajectory, errors: TrajectoryErrors, time_offset: float = 0.0
+    estimate: Trajectory,
+    truth: Trajectory,
+    errors: TrajectoryErrors,
+    time_offset: float = 0.0,
+    lost: Sequence[int] = (),
 ) -> list[str]:
     """Return one line for each likely fault of a truth; times are printed `time_offset` seconds later.
 
-    `errors` is the result of `trajectory_errors` for the two.
+    `errors` is the result of `trajectory_errors` for the two. Clocks are judged without the `lost` poses of
+    the estimate, which say nothing about the truth.
     """
     path = true_path(truth)
     notes = [*_jumps(path, time_offset), *_holes(estimate, errors, path, time_offset)]
@@ -41,7 +48,7 @@ def truth_notes(
     scaling = _scaling(errors)
     orientations = _orientations(estimate, errors, path, bool(scaling))
     if not any("inverted" in line for line in orientations):
-        notes += [*scaling, *_shifted(estimate, errors, path, bool(scaling))]
+        notes += [*scaling, *_shifted(estimate, errors, path, bool(scaling), lost)]
     return notes + orientations
 
 
@@ -116,10 +123,15 @@ def _scaling(errors: TrajectoryErrors) -> list[str]:
     ]
 
 
-def _shifted(estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, with_scale: bool) -> list[str]:
+def _shifted(
+    estimate: Trajectory, errors: TrajectoryErrors, path: TruePath, with_scale: bool, lost: Sequence[int]
+) -> list[str]:
     """Return a line if the truth with all times shifted equally fits much better."""
-    few = slice(None, None, -(-errors.num_poses // MOST_POSES))
-    times, estimated = errors.timestamps[few], estimate.poses[errors.indices[few]]
+    known = ~np.isin(errors.indices, lost)
+    if known.sum() < FEW_POSES:
+        return []
+    few = slice(None, None, -(-int(known.sum()) // MOST_POSES))
+    times, estimated = errors.timestamps[known][few], estimate.poses[errors.indices[known][few]]
     span = float(np.ptp(times))
     longest = min(LONGEST_SHIFT, span / 4)
     shifts = np.linspace(-longest, longest, NUM_SHIFTS)

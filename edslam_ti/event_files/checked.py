@@ -18,25 +18,25 @@ from edslam_ti.event_files.copies import (
     EventCopy,
     EventsInMemory,
     MappedEvents,
+    num_bytes,
 )
-from edslam_ti.event_files.rows import BLOCK, NpyRows
+from edslam_ti.event_files.rows import BLOCK, EventSource, NpyRows
 from edslam_ti.event_files.stream import Progress
 from edslam_ti.event_files.text import TextRows
 from edslam_ti.events import Events
 
 IN_MEMORY = 2_000_000  # rows; smaller arrays are checked each time, which takes a quarter of a second
 SLOW = 50_000_000  # bytes; longer files show a bar while they are checked
-TYPICAL_LINE = 15  # bytes of a line of text with an event, to estimate how many there are
 
 logger = logging.getLogger(__name__)
 
 
 class EventFile:
-    """Sorted events of an `.npy` array or a text file, checked once and then read from a compact copy.
+    """Sorted events of a file that is checked once and then read from a compact copy.
 
-    Rows are pixel column, pixel row, seconds, polarity in {-1, +1} or {0, 1}; in a text, seconds come first.
-    Bad rows are left out; `num_dropped` and `notes` state how many and why. Stamps may be out of order by up
-    to `DISORDER`; slices are sorted and exact.
+    Rows of an array are pixel column, pixel row, seconds, polarity in {-1, +1} or {0, 1}; in a text, seconds
+    come first. Bad rows are left out; `num_dropped` and `notes` state how many and why. Stamps may be out of
+    order by up to `DISORDER`; slices are sorted and exact.
 
     A slice of the copy is memory-mapped: 1e8 events in one slice take no memory of their own unless stamps
     are shifted, which takes 8 bytes per event. `shift` seconds are subtracted from every stamp.
@@ -50,19 +50,38 @@ class EventFile:
         is_text: bool = False,
         progress: Progress | None = None,
     ) -> None:
-        """`progress` follows the first reading of a large file; without it there is a bar on the terminal.
+        """Open an `.npy` array or a text file.
 
+        `progress` follows the first reading of a large file; without it there is a bar on the terminal.
         Raises `DataError` for files without events, with too many bad rows, or with times in another unit.
         """
-        self.path = path
-        self.size: tuple[int, int] | None = None  # neither arrays nor texts state it
-        self.shift = 0.0
         size = (width, height)
-        source = TextRows(path, size) if is_text else NpyRows(path)
+        self._open(TextRows(path, size) if is_text else NpyRows(path), size, progress)
+        self.size: tuple[int, int] | None = None  # neither arrays nor texts state it
+
+    @classmethod
+    def of(
+        cls,
+        source: EventSource,
+        size: tuple[int, int],  # by which events are checked
+        stated: tuple[int, int] | None,  # size that the file states
+        notes: list[str],  # sentences for the user about the opening, that the copy does not hold
+        progress: Progress | None = None,
+    ) -> "EventFile":
+        """Return the events of any source."""
+        result = cls.__new__(cls)
+        result._open(source, size, progress)
+        result.size, result.notes = stated, (*notes, *result.notes)
+        return result
+
+    def _open(self, source: EventSource, size: tuple[int, int], progress: Progress | None) -> None:
+        self.path = source.path
+        self.shift = 0.0
         self._events, summary = _checked(source, size, progress)
         self.num_dropped = summary.num_dropped
         self.notes = summary.notes
         self._num_events = summary.num_events
+        self._origin = summary.origin  # s, zero of the stored stamps
         self._first, self._last = self._events.time_range  # s, as stored
 
     def __len__(self) -> int:
@@ -71,7 +90,8 @@ class EventFile:
     @property
     def time_range(self) -> tuple[float, float]:
         """Times of the first and the last event in seconds, shifted."""
-        return self._first - self.shift, self._last - self.shift
+        shift = self.shift - self._origin
+        return self._first - shift, self._last - shift
 
     def shifted(self, shift: float) -> "EventFile":
         """Return the same events on a clock whose zero is at stamp `shift`."""
@@ -81,11 +101,17 @@ class EventFile:
 
     def between(self, start: float, end: float) -> Events:
         """Return the events with start <= t < end, sorted by time (stable)."""
-        start, end = start + self.shift, end + self.shift
         if not end > start:
             return Events.empty()
-        events = self._events.between(start, end)
-        return replace(events, t=events.t - self.shift) if self.shift else events
+        shift = self.shift - self._origin
+        if not self._origin:
+            events = self._events.between(start + shift, end + shift)
+            return replace(events, t=events.t - shift) if shift else events
+        # Adding the origin rounds stamps: take a little more, and compare the rounded ones.
+        slack = 1e-6
+        events = self._events.between(start + shift - slack, end + shift + slack)
+        events = replace(events, t=events.t - shift) if shift else events
+        return events.between(start, end)
 
 
 class CheckedRows:
@@ -126,11 +152,11 @@ class CheckedRows:
 
 
 def _checked(
-    source: NpyRows | TextRows, size: tuple[int, int], progress: Progress | None
+    source: EventSource, size: tuple[int, int], progress: Progress | None
 ) -> tuple[EventsInMemory | MappedEvents | CheckedRows, CopySummary]:
     """Return a file's good events: from its copy, which is made if missing, or without a copy."""
     is_small = isinstance(source, NpyRows) and len(source) <= IN_MEMORY
-    stored = EventCopy(cache_folder() / "events", source.path, size, source.columns)
+    stored = EventCopy(cache_folder() / "events", source.path, size, source.columns, source.part)
     if not is_small:
         summary = stored.read()
         if summary is not None:
@@ -139,14 +165,14 @@ def _checked(
     checker = EventChecker(source, size, columns)
 
     def summarised(num_events: int) -> CopySummary:
-        notes = list(source.notes) if isinstance(source, TextRows) else []
+        notes = list(source.notes)
         if columns.order != source.columns:
             notes.append(f"columns look like {' '.join(columns.order)} and are read in that order")
         notes += bad_rows_note(checker.bad, checker.num_rows, source.counted)
         dropped = checker.bad.number + (len(source.notes) if isinstance(source, TextRows) else 0)
         if num_events == 0:
             raise DataError(f"{source.name}: expected events, got none that is good")
-        return CopySummary(num_events, checker.num_rows, dropped, tuple(notes))
+        return CopySummary(num_events, checker.num_rows, dropped, tuple(notes), source.origin)
 
     def shown(update: Progress) -> Iterator[Events]:
         for part in checker.events():
@@ -155,7 +181,7 @@ def _checked(
 
     with _bar(source.path, progress) as update:
         if not is_small:
-            most = len(source) if isinstance(source, NpyRows) else source.num_bytes // TYPICAL_LINE
+            most = source.most_events()
             try:
                 if stored.has_room(most):
                     summary = stored.write(shown(update), summarised)
@@ -180,7 +206,7 @@ def _bar(path: Path, progress: Progress | None) -> Iterator[Progress]:
     """Show a bar for a large file, unless the caller receives the progress."""
     if progress is not None:
         yield progress
-    elif path.stat().st_size < SLOW:
+    elif num_bytes(path) < SLOW:
         yield lambda share: None
     else:
         from rich.console import Console

@@ -18,6 +18,7 @@ MOST_BAD = 0.01  # share of the rows; more bad rows mean that the file has anoth
 WINDOW = 8  # blocks, about a million rows, in which a larger share of bad rows is refused at once
 NEIGHBOURS = 16  # events on either side with which a stamp is compared
 ORDERS = ("xytp", "txyp", "xypt")  # orders of columns that programs write
+LARGEST_SIZE = (32_767, 32_767)  # pixels; where the size of the image is not known
 ENOUGH_TO_TELL = 100  # rows needed to detect an order that is not the expected one
 # A few stamps at either end of a recording may belong to another time (left over from before, or a broken
 # last row). They do if a gap of this length, in seconds and in lengths of the recording, separates them from

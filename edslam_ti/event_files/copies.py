@@ -1,16 +1,16 @@
 """Compact copies of checked events in the user's cache: four raw arrays in a folder, 13 bytes per event.
 
     x.bin, y.bin     int16     pixel
-    t.bin            float64   seconds as the file states them, ascending
+    t.bin            float64   seconds as the file states them, less an origin, ascending
     polarity.bin     int8      -1 or +1
-    events.json      number of events, and rows that were left out
+    events.json      number of events, rows that were left out, origin of the stamps
 
 Seconds stay float64. Whole microseconds would take as much space, and change the stamps of simulated
 recordings, which are in nanoseconds or float32.
 
-A copy is identified by the path, size and modification time of its source. It is written under a temporary
-name that contains the process's number. So the remains of a killed process are never taken for a finished
-copy, and the next process removes them.
+A copy is identified by the path, size and modification time of its source, and by the camera. It is written
+under a temporary name that contains the process's number. So the remains of a killed process are never taken
+for a finished copy, and the next process removes them.
 """
 
 import contextlib
@@ -47,6 +47,7 @@ class CopySummary:
     num_rows: int  # of the source
     num_dropped: int
     notes: tuple[str, ...] = ()  # sentences for the user
+    origin: float = 0.0  # s, to be added to the stored stamps
 
 
 class EventsInMemory:
@@ -109,13 +110,14 @@ def _mapped(file: BinaryIO, dtype: np.dtype) -> np.ndarray:
 class EventCopy:
     """The compact copy of one source in a folder of copies."""
 
-    def __init__(self, parent: Path, source: Path, size: tuple[int, int], settings: str) -> None:
-        """`settings` names everything else that the copy depends on."""
+    def __init__(
+        self, parent: Path, source: Path, size: tuple[int, int], settings: str, part: str = ""
+    ) -> None:
+        """`settings` names everything else that the copy depends on; each `part` has a copy of its own."""
         self._parent = parent
         self._source = source
-        status = source.stat()
-        path = _digest(str(source.resolve()))
-        state = _digest(f"{VERSION}|{status.st_size}|{status.st_mtime_ns}|{size}|{settings}")
+        path = _digest(str(source.resolve()) + (f"|{part}" if part else ""))
+        state = _digest(f"{VERSION}|{_state(source)}|{size}|{settings}")
         self._prefix = f"{_plain(source.parent.name)}_{path}_"
         self.folder = parent / f"{self._prefix}{state}"
 
@@ -173,6 +175,21 @@ class EventCopy:
         except OSError:
             if self.read() is None:  # else another process was faster
                 raise
+
+
+def num_bytes(source: Path) -> int:
+    """Return the size of a file, or of the files in a folder."""
+    return sum(path.stat().st_size for path in _files(source))
+
+
+def _files(source: Path) -> list[Path]:
+    return sorted(path for path in source.iterdir() if path.is_file()) if source.is_dir() else [source]
+
+
+def _state(source: Path) -> str:
+    """Return size and modification time of a file, or of all files in a folder."""
+    states = [path.stat() for path in _files(source)]
+    return "|".join(f"{state.st_size}|{state.st_mtime_ns}" for state in states)
 
 
 def remove_leftovers(parent: Path) -> None:

@@ -18,15 +18,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from edslam_ti.errors import DataError, MissingExtraError, plain
-from edslam_ti.event_files.checks import detected_order
+from edslam_ti.event_files import ecf
+from edslam_ti.event_files.checks import LARGEST_SIZE, detected_order
 from edslam_ti.event_files.choice import chosen
-from edslam_ti.event_files.rows import FIELD_NAMES, PROBE_LENGTH, PROBES
+from edslam_ti.event_files.ecf import EcfDataset
+from edslam_ti.event_files.rows import PROBE_LENGTH, PROBES, named_columns
 from edslam_ti.event_files.stream import Clock, RawEvents
 from edslam_ti.event_files.units import clock_of
 
 INDEX_NAMES = ("ms_to_idx", "ms_map_idx")  # k-th entry: first event at or after k milliseconds
 CACHE = 16_000_000  # bytes of decompressed chunks that are kept for each dataset
-LARGEST = 32_767  # pixels; where the size of the image is not known
 INDEX_SLACK = 1000  # us; an entry further off means that the index belongs to other events
 INSTALL = "pip install 'edslam-ti[formats]'"
 
@@ -47,8 +48,11 @@ class Hdf5Columns:
         place, self.notes = chosen(f"{path}", "groups with events", tables, group)
         self.name = f"{path} ({place})"
         self._table = tables[place]
-        for dataset in self._table.datasets:
-            _check_filters(self.name, dataset)
+        if isinstance(self._table, _Compound) and _needs_ecf(self._table.datasets[0]):
+            self._table.datasets = [EcfDataset(self._table.datasets[0])]
+        else:
+            for dataset in self._table.datasets:
+                _check_filters(self.name, dataset)
         found = file[place]
         nearby = [found, found.parent, file] if isinstance(self._table, _Separate) else [found.parent, file]
         self.size = _stated_size(nearby, found)
@@ -56,7 +60,7 @@ class Hdf5Columns:
         if self._length == 0:
             raise DataError(f"{self.name}: expected events, got none")
         if isinstance(self._table, _Matrix):
-            known = size or self.size or (LARGEST, LARGEST)
+            known = size or self.size or LARGEST_SIZE
             self._table.order = detected_order(self._sample(), "xytp", known)
         self.clock: Clock = clock_of(self, self.name, _offset(nearby))
         self._index = self._checked_index(nearby)
@@ -208,7 +212,7 @@ def _tables(file: Any) -> dict[str, _Table]:
 
     def look(name: str, found: Any) -> None:
         if isinstance(found, h5py.Dataset):
-            names = _named(found.dtype.names or ())
+            names = named_columns(found.dtype.names or ())
             if names and found.ndim == 1:
                 tables[name] = _Compound(found, names)
             elif _is_matrix(found) and name.lower().endswith("events"):
@@ -218,7 +222,7 @@ def _tables(file: Any) -> dict[str, _Table]:
         columns = {
             key: value for key, value in here.items() if value.ndim == 1 and value.dtype.kind in "fiub"
         }
-        names = _named(columns)
+        names = named_columns(columns)
         if names:
             tables[name] = _Separate({letter: columns[key] for letter, key in names.items()})
 
@@ -231,26 +235,23 @@ def _is_matrix(dataset: Any) -> bool:
     return bool(dataset.ndim == 2 and dataset.shape[1] == 4 and dataset.dtype.kind in "fiu")
 
 
-def _named(names: Any) -> dict[str, str]:
-    """Return the names that mean x, y, t, p, by letter; empty: one is missing or doubtful."""
-    result = {}
-    for letter, meanings in FIELD_NAMES.items():
-        matching = [name for name in names if name.lower() in (*meanings, f"{letter}s")]
-        if len(matching) != 1:
-            return {}
-        result[letter] = matching[0]
-    return result
-
-
 def _check_filters(name: str, dataset: Any) -> None:
     """Refuse a compression that the installed libraries do not know."""
-    h5py = _h5py()
+    for code, label in _missing_filters(dataset):
+        what = plain(label.decode("latin-1"), 40) or "unknown"
+        raise MissingExtraError(f"{name}: compressed with HDF5 filter {code} ({what}); {INSTALL}")
+
+
+def _needs_ecf(dataset: Any) -> bool:
+    """Return whether Prophesee's compression alone is missing for a table."""
+    return [code for code, _ in _missing_filters(dataset)] == [ecf.FILTER] and dataset.dtype == ecf.EVENT
+
+
+def _missing_filters(dataset: Any) -> list[tuple[int, bytes]]:
+    """Return numbers and names of the compressions that the installed libraries do not know."""
     settings = dataset.id.get_create_plist()
-    for k in range(settings.get_nfilters()):
-        code, _, _, label = settings.get_filter(k)
-        if not h5py.h5z.filter_avail(code):
-            what = plain(label.decode("latin-1"), 40) or "unknown"
-            raise MissingExtraError(f"{name}: compressed with HDF5 filter {code} ({what}); {INSTALL}")
+    used = [settings.get_filter(k) for k in range(settings.get_nfilters())]
+    return [(code, label) for code, _, _, label in used if not _h5py().h5z.filter_avail(code)]
 
 
 def _offset(nearby: list[Any]) -> int:

@@ -1,7 +1,7 @@
 """Reads events of an `.npy` array in blocks of rows, in the file's own order of columns."""
 
 import tokenize
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -35,9 +35,19 @@ class RowBlock:
 class EventSource(Protocol):
     """A file of events with four numbers each."""
 
+    path: Path  # a file, or the folder of a recording
     name: str  # of the user's own file
+    part: str  # of the file: one of several cameras; empty where a file holds one
     columns: str  # the expected order, such as "xytp"
-    counted: str  # unit in messages: "row" or "line"
+    counted: str  # unit in messages: "row", "line" or "event"
+    notes: list[str]  # sentences for the user about the last reading
+
+    @property
+    def origin(self) -> float:
+        """Seconds that are to be added to the stamps of `blocks`."""
+
+    def most_events(self) -> int:
+        """Return about how many events there are, rather too many."""
 
     def blocks(self) -> Iterator[RowBlock]:
         """Yield all rows in the order of the file."""
@@ -67,18 +77,21 @@ class _Layout:
 class NpyRows:
     """Rows of an array [N, 4], or of a structured array [N] with fields x, y, t, p."""
 
-    columns = "xytp"
-    counted = "row"
+    part, columns, counted, origin = "", "xytp", "row", 0.0
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.name = str(path)
+        self.notes: list[str] = []
         self._layout = _read_layout(path)
         if len(self) == 0:
             raise DataError(f"{path}: expected events, got an empty array")
 
     def __len__(self) -> int:
         return self._layout.num_rows
+
+    def most_events(self) -> int:
+        return len(self)
 
     def column(self, index: int) -> str:
         fields = self._layout.fields
@@ -189,3 +202,14 @@ def _fields(path: Path, dtype: np.dtype) -> tuple[str, ...]:
             "cannot hold; save it as float64"
         )
     return tuple(found)
+
+
+def named_columns(names: Iterable[str]) -> dict[str, str]:
+    """Return which names mean x, y, t and p, by letter; empty: one is missing or doubtful."""
+    names, result = list(names), {}
+    for letter, meanings in FIELD_NAMES.items():
+        matching = [name for name in names if name.lower() in (*meanings, f"{letter}s")]
+        if len(matching) != 1:
+            return {}
+        result[letter] = matching[0]
+    return result

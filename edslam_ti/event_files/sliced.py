@@ -92,12 +92,16 @@ class SlicedEvents:
 class _ColumnRows:
     """The same events as rows x, y, t [s], p, for `EventChecker` (`EventSource`)."""
 
-    columns = "xytp"
-    counted = "event"
+    part, columns, counted, origin = "", "xytp", "event", 0.0
 
     def __init__(self, columns: EventColumns) -> None:
+        self.path = columns.path
         self.name = columns.name
+        self.notes: list[str] = []
         self._columns = columns
+
+    def most_events(self) -> int:
+        return len(self._columns)
 
     def column(self, index: int) -> str:
         return self.columns[index]

@@ -10,6 +10,7 @@ import numpy as np
 from edslam_ti.errors import DataError
 from edslam_ti.event_files.rows import RowBlock
 
+TYPICAL_LINE = 15  # bytes of a line with an event
 CHUNK = 4_000_000  # characters read at once, some 200,000 lines
 LONGEST_LINE = 10_000  # characters; a longer one is cut into several
 SHOWN = 60  # characters of a line in messages
@@ -23,8 +24,7 @@ WIDE_MARKS = ("\xff\xfe", "\xfe\xff", "\x00\x00\xfe\xff")
 class TextRows:
     """Lines 't x y p'. Blank lines, text after '#', and a first line 'width height' are skipped."""
 
-    columns = "txyp"
-    counted = "line"
+    part, columns, counted, origin = "", "txyp", "line", 0.0
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
         """`size` is the image's width and height; a header must agree with it."""
@@ -37,6 +37,9 @@ class TextRows:
         if self.num_bytes == 0:
             raise DataError(f"{path}: the file is empty; expected lines 't x y p'")
         self.notes: list[str] = []  # of the last reading
+
+    def most_events(self) -> int:
+        return self.num_bytes // TYPICAL_LINE
 
     def column(self, index: int) -> str:
         return f"column {index + 1}"

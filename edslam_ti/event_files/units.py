@@ -10,6 +10,7 @@ from edslam_ti.event_files.stream import Clock
 
 EPOCH_NANOSECONDS = 1e17  # larger whole numbers are nanoseconds since the epoch; 1e17 us are 3000 years
 EDGE = 1000  # stamps looked at, at either end
+ENOUGH_TO_TELL = 10  # different stamps; fewer whole ones may be seconds by chance
 
 
 class Stamps(Protocol):
@@ -21,10 +22,10 @@ class Stamps(Protocol):
 
 
 def clock_of(stamps: Stamps, name: str, offset: int = 0) -> Clock:
-    """Return the clock of stamps: whole numbers are microseconds, others seconds.
+    """Return the clock of stamps: whole numbers are microseconds, also where they are stored as floats.
 
-    Whole numbers are nanoseconds if they would be a date after the year 5000 in microseconds, or a recording
-    of more than two days. Raises `DataError` for stamps with fractions that are not in seconds.
+    They are nanoseconds if they would be a date after the year 5000 in microseconds, or a recording of more
+    than two days. Numbers with fractions are seconds; raises `DataError` where they cannot be.
     """
     number = len(stamps)
     parts = [stamps.times(0, min(EDGE, number)), stamps.times(max(0, number - EDGE), number)]
@@ -34,7 +35,10 @@ def clock_of(stamps: Stamps, name: str, offset: int = 0) -> Clock:
         return Clock(1e6, offset)
     first, last = (float(np.median(part[np.isfinite(part)])) if len(part) else 0.0 for part in parts)
     span = last - first
-    if values.dtype.kind != "f" or (span > LONGEST_RECORDING and (values == np.rint(values)).all()):
+    is_whole = values.dtype.kind != "f" or (
+        len(np.unique(values)) >= ENOUGH_TO_TELL and bool((values == np.rint(values)).all())
+    )
+    if is_whole:
         is_late = abs(float(values[0]) + offset) > EPOCH_NANOSECONDS
         return Clock(1e9 if is_late or span > LONGEST_RECORDING * 1e6 else 1e6, offset)
     if span > LONGEST_RECORDING:

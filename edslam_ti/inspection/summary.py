@@ -25,9 +25,8 @@ def _facts(report: Report) -> list[str]:
         f"{camera.cx:.6g}, cy {camera.cy:.6g}, undistorted"
     )
     result += _events(report) + _depth(report) + _images(report) + _truth(report)
-    imu = getattr(sequence, "imu", None)
-    if imu is not None:
-        result.append(f"IMU: {len(imu.timestamps)} samples")
+    if sequence.imu is not None:
+        result.append(f"IMU: {len(sequence.imu)} samples")
     if sequence.time_offset:
         result.append(f"clock: the recording's own starts at {sequence.time_offset:.6f} s")
     return result + list(sequence.notes)

@@ -220,6 +220,7 @@ class GaussianMapper:
             raw["log_scales"],
             raw["logit_opacities"],
             colors,
+            self._config.ply_harmonics,
         )
 
     def _view(self, T_world_camera: np.ndarray) -> RenderOutput:  # [4, 4]

@@ -9,14 +9,12 @@ from edslam_ti.output import atomic_file
 
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc
 
-# The layout of Kerbl et al. 2023. Viewers look properties up by name; f_rest_* (higher harmonics) may be
-# absent, and the normals, always zero, are kept because some readers skip by position.
-SPLAT_PROPERTIES = (
-    *("x", "y", "z", "nx", "ny", "nz"),
-    *("f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2"),
-    *("rot_0", "rot_1", "rot_2", "rot_3"),
-)
+# The layout of Kerbl et al. 2023. Most viewers look properties up by name; some demand the 45 coefficients
+# f_rest_* of harmonics up to degree 3. The normals, always zero, are there because some readers skip by
+# position.
+PLACE_AND_COLOUR = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+SPLAT_PROPERTIES = (*PLACE_AND_COLOUR, *SHAPE)
 
 
 def write_gaussian_ply(
@@ -26,10 +24,12 @@ def write_gaussian_ply(
     log_scales: np.ndarray,  # [N, 3] log metres
     logit_opacities: np.ndarray,  # [N]
     colors: np.ndarray,  # [N], [N, 1] or [N, 3] brightness in [0, 1]
+    harmonics: int = 0,
 ) -> None:
     """Write Gaussians in the 3DGS layout that splat viewers open (binary little endian, float32).
 
-    Raise DataError where there are none, or where a value is not finite.
+    Coefficients of spherical harmonics above degree 0, up to degree `harmonics`, are zeros. Raise DataError
+    where there are no Gaussians, or where a value is not finite.
     """
     count = len(means)
     if count == 0:
@@ -46,13 +46,15 @@ def write_gaussian_ply(
             raise DataError(f"{name}: expected shape {(count, width)}, got {values.shape}")
         if not np.isfinite(values).all():
             raise DataError(f"{name}: expected finite values; {path.name} is not written")
-    table = np.zeros(count, dtype=[(name, "<f4") for name in SPLAT_PROPERTIES])
+    rest = tuple(f"f_rest_{k}" for k in range(3 * ((harmonics + 1) ** 2 - 1)))
+    names = (*PLACE_AND_COLOUR, *rest, *SHAPE)
+    table = np.zeros(count, dtype=[(name, "<f4") for name in names])
     columns = [means, np.zeros((count, 3)), (parts["colors"][0] - 0.5) / SH_C0]
     columns += [parts["logit_opacities"][0], log_scales, quats / np.linalg.norm(quats, axis=1, keepdims=True)]
     for name, column in zip(SPLAT_PROPERTIES, np.concatenate(columns, axis=1).T):
         table[name] = column
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for name in SPLAT_PROPERTIES] + ["end_header", ""]
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode("ascii"))
         file.write(table.tobytes())

@@ -165,7 +165,8 @@ def trajectory_metrics(run: Run, truth: Trajectory | None) -> Metrics:
             errors = trajectory_errors(estimate, original)
             coverage = errors.coverage
             frontend = ate_rmse_cm(run.slam.frontend_trajectory, original)
-            notes = truth_notes(estimate, original, errors, run.sequence.time_offset)
+            lost = [k for k, result in enumerate(run.slam.results) if not result.converged]
+            notes = truth_notes(estimate, original, errors, run.sequence.time_offset, lost)
         except DataError as error:
             notes = [str(error)]
     return {

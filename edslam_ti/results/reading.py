@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from edslam_ti.errors import DataError, LostTrackError
+from edslam_ti.errors import DataError, LostTrackError, plain
 from edslam_ti.journal import JOURNAL, read_journal
 from edslam_ti.mesh_reading import read_point_cloud, read_triangle_mesh
 from edslam_ti.results.run_folder import is_unfinished
@@ -83,6 +83,8 @@ def _read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / "metrics.json"
     try:
         metrics: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not readable as JSON ({error})") from error
+    except (ValueError, RecursionError) as error:  # also huge integers, wrong encodings, deep nesting
+        raise DataError(f"{path}: not readable as JSON ({plain(error)})") from error
+    if not isinstance(metrics, dict):
+        raise DataError(f"{path}: expected an object of metrics, got {plain(metrics, 60)}")
     return metrics

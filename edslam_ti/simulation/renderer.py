@@ -64,6 +64,12 @@ class Renderer:
     ) -> tuple[np.ndarray, Hits, np.ndarray, np.ndarray]:
         """Return rays, hits, grey and surface of len(pixels) * len(offsets) rays."""
         rays = pixel_rays(T_world_camera, self.camera.intrinsics, self.camera.width, pixels, offsets)
+        return self._shaded(T_world_camera, rays, scale)
+
+    def _shaded(
+        self, T_world_camera: np.ndarray, rays: np.ndarray, scale: float
+    ) -> tuple[np.ndarray, Hits, np.ndarray, np.ndarray]:
+        """Return rays [N, 6], whose directions have camera z = 1, with hits, grey and surface."""
         hits = self._caster.cast(rays)
         R = T_world_camera[:3, :3]
         steps = np.stack([R[:, 0] / self.camera.fx, R[:, 1] / self.camera.fy]) * scale

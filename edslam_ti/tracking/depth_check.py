@@ -13,6 +13,8 @@ from collections import deque
 
 import numpy as np
 
+from edslam_ti.camera import NEAREST, Camera
+
 # A frame's depth contradicts where both poses are so far apart, and the image fits worse with depth,
 SMALLEST_FLOW = 0.6  # px of brightness images, at least
 TIMES_USUAL = 5.0  # and so many times what is usual,
@@ -26,6 +28,12 @@ UNUSUAL = 1.15  # times the usual misfit, from which on a frame is looked at
 FITS = 1.6  # times the usual misfit: up to there brightness alone may stand for a frame lost with depth
 MOST_IN_A_ROW = 4  # frames left out; from then on brightness is in doubt as well
 REMEMBERED = 20  # frames
+
+# Depth of another scale: the median |log| ratio of depths at the same points, seen from two poses.
+OTHER_SCALE = 0.25  # at least, to all frames that agree,
+SAME_SCALE = 0.08  # which differ from one another by less
+MIN_COMMON = 0.02  # share of the pixels that both frames must measure
+COMPARED = 4000  # pixels of a frame, about
 
 MOST_SETS = 21  # of frames that are tried; beyond, one frame after the other
 
@@ -44,6 +52,44 @@ def sets_to_try(frames: list[int], number: int, left_out: frozenset[int]) -> lis
     if math.comb(len(frames), number) <= MOST_SETS:
         return [frozenset(chosen) for chosen in itertools.combinations(frames, number)]
     return [left_out | {k} for k in frames if k not in left_out]
+
+
+def log_ratio(
+    depth: np.ndarray,  # [h, w] metres, 0 = missing
+    other: np.ndarray,  # [h, w] of another frame
+    T_other_camera: np.ndarray,  # [4, 4]
+    camera: Camera,
+) -> float:
+    """Return the median |log| of a frame's depth, moved to another frame, over that measured there.
+
+    It is NaN where hardly any pixel is measured in both.
+    """
+    step = max(1, int(np.sqrt(depth.size / COMPARED)))
+    v, u = np.mgrid[0 : depth.shape[0] : step, 0 : depth.shape[1] : step]
+    d = depth[v, u]
+    v, u, d, number = v[d > 0], u[d > 0], d[d > 0], d.size
+    points = camera.back_project_pixels(u, v, d) @ T_other_camera[:3, :3].T + T_other_camera[:3, 3]
+    points = points[points[:, 2] > NEAREST]
+    u, v, z = camera.project(points)
+    column, row = np.rint(u), np.rint(v)
+    seen = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    there = other[row[seen].astype(np.intp), column[seen].astype(np.intp)]
+    measured = there > 0
+    if np.count_nonzero(measured) < MIN_COMMON * number:
+        return math.nan
+    return float(np.median(np.abs(np.log(z[seen][measured] / there[measured]))))
+
+
+def of_other_scale(ratios: np.ndarray) -> list[int]:  # [F, F] `log_ratio` of each pair
+    """Return the frames whose depth differs from that of all others; none where these do not agree."""
+    ratios = np.maximum(ratios, ratios.T)  # NaN stays: nothing is known of that pair
+    np.fill_diagonal(ratios, 0.0)
+    agrees = ratios < SAME_SCALE
+    agreed = agrees[agrees.sum(1).argmax()]
+    rest = ~agreed
+    is_minority = 2 * np.count_nonzero(rest) < len(ratios) and len(ratios) > 2
+    is_clear = agrees[np.ix_(agreed, agreed)].all() and (ratios[np.ix_(rest, agreed)] > OTHER_SCALE).all()
+    return np.flatnonzero(rest).tolist() if is_minority and is_clear else []
 
 
 class DepthCheck:

@@ -5,13 +5,20 @@ frame's pose by brightness alone is then far from that with depth, some depth is
 perhaps: sets of frames are tried without theirs, until nothing contradicts and brightness fits far better.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from edslam_ti.alignment import mean_cost
 from edslam_ti.geometry import inverse
-from edslam_ti.tracking.depth_check import SMALLEST_FLOW, SMALLEST_MISFIT, sets_to_try
+from edslam_ti.tracking.depth_check import (
+    SMALLEST_FLOW,
+    SMALLEST_MISFIT,
+    log_ratio,
+    of_other_scale,
+    sets_to_try,
+)
 from edslam_ti.tracking.keyframes import BrightnessFrame, BrightnessKeyframe
 from edslam_ti.tracking.segment import Segment
 from edslam_ti.trajectory import PathDraft, Trajectory
@@ -56,10 +63,13 @@ def first_image(segment: Segment, path: PathDraft) -> FirstImage | None:
         return None
     by_surfaces = {f.index: path.pose(f.index) for f in segment.recent}
     found = _solved(segment, path, ROUNDS, frozenset())
-    if max(found.flows) <= SMALLEST_FLOW:
+    other = _of_other_scale(found)
+    if not other and max(found.flows) <= SMALLEST_FLOW:
         return found
     state = segment.aligner.random_state
-    best = _without_wrong_depth(found, by_surfaces)
+    best = _trial(found, by_surfaces, other) if other else found
+    if max(best.flows) > SMALLEST_FLOW:
+        best = _without_wrong_depth(best, by_surfaces)
     if not best.left_out:
         segment.aligner.random_state = state  # as if nothing had been tried
         return found
@@ -94,6 +104,18 @@ def _contradictions(segment: Segment, keyframe: BrightnessKeyframe, path: PathDr
     return flows
 
 
+def _of_other_scale(found: FirstImage) -> frozenset[int]:
+    """Return the frames whose depth differs from all others', seen from the poses found."""
+    frames, camera = found.segment.with_depth, found.segment.aligner.camera
+    ratios = np.zeros((len(frames), len(frames)))
+    for (i, a), (j, b) in itertools.permutations(enumerate(frames), 2):
+        assert a.depth is not None
+        assert b.depth is not None
+        T_b_a = inverse(found.path.pose(b.index)) @ found.path.pose(a.index)
+        ratios[i, j] = log_ratio(a.depth.small, b.depth.small, T_b_a, camera)
+    return frozenset(frames[k].index for k in of_other_scale(ratios))
+
+
 def _without_wrong_depth(found: FirstImage, by_surfaces: dict[int, np.ndarray]) -> FirstImage:
     """Return the first image without the depth of the fewest frames that leave no contradiction.
 
@@ -124,10 +146,11 @@ def _trial(found: FirstImage, by_surfaces: dict[int, np.ndarray], left_out: froz
     known = _by_depth(segment, by_surfaces)
     for frame in recent:
         path.replace(frame.index, known.at(frame.timestamp))
-    is_first_wrong = 0 in left_out
+    is_first_wrong = 0 in left_out | found.left_out
     if not is_first_wrong:
         _keep_first(path, recent, found.path.pose(0))
-    image = _solved(segment, path, CAREFUL_ROUNDS, left_out, fixed=-1 if is_first_wrong else 0)
+    all_left_out = left_out | found.left_out
+    image = _solved(segment, path, CAREFUL_ROUNDS, all_left_out, fixed=-1 if is_first_wrong else 0)
     if is_first_wrong:
         _keep_first(path, recent, found.path.pose(0))
     return image

@@ -27,7 +27,7 @@ from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
 from edslam_ti.tracking.consistency import Consistency, ConsistencyCheck
-from edslam_ti.tracking.depth_check import FITS, UNUSUAL, DepthCheck, left_out
+from edslam_ti.tracking.depth_check import FITS, OTHER_SCALE, UNUSUAL, DepthCheck, left_out, log_ratio
 from edslam_ti.tracking.first_image import first_image
 from edslam_ti.tracking.gaps import EventRate, bridge
 from edslam_ti.tracking.keyframes import (
@@ -183,7 +183,10 @@ class BrightnessTracker:
             return None
         is_good = best.result.converged
         is_wanted = is_good and self._check.wants()
-        if is_good and not is_wanted and best.misfit < UNUSUAL * usual_misfit:
+        T_now_keyframe = inverse(path.newest) @ path.pose(keyframe.index)
+        ratio = log_ratio(keyframe.depth.small, newest.depth.small, T_now_keyframe, self._aligner.camera)
+        is_other_scale = is_good and ratio > OTHER_SCALE
+        if is_good and not is_wanted and not is_other_scale and best.misfit < UNUSUAL * usual_misfit:
             return None
         aligned = self._segment.align(keyframe, newest, None, path.newest, path)
         result = self._segment.judged(aligned, keyframe, path.newest, path)
@@ -191,7 +194,9 @@ class BrightnessTracker:
             return None
         T_now_then = inverse(result.T_world_camera) @ path.newest
         flow = self._aligner.flow(newest.depth.small, T_now_then)
-        if is_good:
+        if is_other_scale:
+            is_wrong = self._depth_check.may_leave_out()
+        elif is_good:
             is_wrong = self._depth_check.contradicts(flow, best.misfit, aligned.misfit)
         else:
             fits = aligned.misfit < FITS * usual_misfit

@@ -371,7 +371,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "focal length nan": (_camera(fx=float("nan")), r"camera\.json: fx: .*finite"),
     "centres elsewhere": (_camera(pixel_centres="corner"), r"pixel_centres: .*'integer' or 'half'"),
     "misspelt key": (_camera(depth_scal=5000), r"unknown key 'depth_scal'; did you mean 'depth_scale'"),
-    "distorted": (_camera(k1=-0.3), r"'k1': expected an undistorted camera"),
     "centre outside": (
         _camera(cx=40.0),
         r"camera\.json: expected the principal point inside the 32x24",
@@ -403,8 +402,20 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "string of 1 MB": (_camera(width="9" * 1_000_000), r"camera\.json: width: .* got '999.*\.\.\.999"),
     "not UTF-8": (_bytes("camera.json", b'{"description": "caf\xe9"}'), r"JSON: not in UTF-8"),
-    "distortion nested": (_camera(distortion=[[1], [2, 3]]), r"'distortion': expected an undistorted camera"),
-    "distortion a word": (_camera(k1="abc"), r"'k1': expected an undistorted camera"),
+    "distortion nested": (
+        _camera(distortion=[[1], [2, 3]]),
+        r"json: distortion\.0: .* valid number, got \[1\]",
+    ),
+    "distortion a word": (_camera(k1="abc"), r"json: k1: .* valid number, got 'abc'"),
+    "distortion too short": (_camera(distortion=[0.1, 0.2]), r"json: .* expected 4 or 5 coefficients"),
+    "distortion unknown": (
+        _camera(distortion_model="fov"),
+        r"json: distortion model: expected one of .* got 'fov'",
+    ),
+    "distortion of no lens": (
+        _camera(k1=500.0),
+        r"json: expected distortion .* that shows 1 % of the undistorted",
+    ),
 }
 
 
@@ -441,3 +452,43 @@ def test_camera_json_may_have_a_byte_order_mark_and_unknown_keys(tmp_path: Path)
     values = CAMERA | {"k1": 0.0, "distortion": [0, 0], "serial": "x" * 100_000, "nested": {"a": [1]}}
     (folder / "camera.json").write_text("\ufeff" + json.dumps(values), encoding="utf-8")
     assert EventReplicaSequence(folder).camera.fx == 30
+
+
+DISTORTIONS = {
+    "keys": {"k1": -0.25, "k2": 0.05, "p1": 0.001},
+    "list": {"distortion": [-0.25, 0.05, 0.001, 0.0]},
+    "other name": {"distortion_coefficients": [-0.25, 0.05, 0.001, 0.0, 0.0]},
+    "fisheye": {"distortion_model": "equidistant", "k1": -0.1, "k2": 0.01},
+}
+
+
+@pytest.mark.parametrize("name", DISTORTIONS)
+def test_a_distorted_camera_is_undistorted(tmp_path: Path, name: str) -> None:
+    folder = write_sequence(tmp_path / "s", camera=CAMERA | {"pixel_centres": "integer"} | DISTORTIONS[name])
+    random = np.random.default_rng(3)
+    grey = random.integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)
+    depth = random.integers(1000, 3000, (HEIGHT, WIDTH)).astype(np.uint16)
+    cv2.imwrite(str(folder / "images/frame000000.png"), grey)
+    cv2.imwrite(str(folder / "depth/frame000000.png"), depth)
+    sequence = EventReplicaSequence(folder)
+    K, size = sequence.camera.matrix, (WIDTH, HEIGHT)
+    if name == "fisheye":
+        D = np.array([-0.1, 0.01, 0, 0])
+        maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), K, size, cv2.CV_32FC1)
+    else:
+        D = np.array([-0.25, 0.05, 0.001, 0, 0])
+        maps = cv2.initUndistortRectifyMap(K, D, np.eye(3), K, size, cv2.CV_32FC1)
+    expected = cv2.remap(grey.astype(np.float32) / 255, *maps, cv2.INTER_LINEAR)
+    assert np.abs(sequence.image(0) - expected).max() < 1e-6
+    nearest = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+    assert np.abs(sequence.depth(0) - nearest / 1000).max() < 1e-3
+    rows = np.load(folder / "event_threshold_0.1/gray_events_data.npy")
+    raw, counts = np.zeros((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH))
+    np.add.at(raw, (rows[:, 1].astype(int), rows[:, 0].astype(int)), 1)
+    events = sequence.events(0, 1)
+    np.add.at(counts, (events.y, events.x), 1)
+    assert (counts == cv2.remap(raw, np.rint(maps[0]), np.rint(maps[1]), cv2.INTER_NEAREST)).all()
+    (folder / "camera.json").write_text(
+        json.dumps(CAMERA | {"pixel_centres": "integer", "depth_undistorted": True} | DISTORTIONS[name])
+    )
+    assert np.abs(EventReplicaSequence(folder).depth(0) - depth / 1000).max() < 1e-3

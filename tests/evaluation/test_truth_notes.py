@@ -205,3 +205,15 @@ def test_positions_that_are_no_metres_are_refused_in_one_line(value: float) -> N
     poses[:, :3, 3] = value
     with pytest.raises(DataError, match="truth: expected positions in metres"):
         trajectory_errors(path_of(), Trajectory(TIMES, poses))
+
+
+def test_lost_poses_say_nothing_about_the_clock() -> None:
+    def positions(times: np.ndarray) -> np.ndarray:
+        return np.stack([np.sin(4 * times), np.cos(5 * times), times], -1)
+
+    is_lost = np.arange(NUM) > NUM // 4
+    truth = path_of(positions(TIMES))
+    estimate = path_of(positions(np.where(is_lost, TIMES - 0.1, TIMES)))  # lost: its pose lags behind
+    errors = trajectory_errors(estimate, truth)
+    assert "early" in " ".join(truth_notes(estimate, truth, errors))
+    assert truth_notes(estimate, truth, errors, lost=np.flatnonzero(is_lost).tolist()) == []

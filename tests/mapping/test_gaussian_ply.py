@@ -1,6 +1,7 @@
 """Gaussians in a file are what splat viewers expect."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from edslam_ti.mapping.gaussian_ply import SPLAT_PROPERTIES, read_gaussian_ply, 
 from edslam_ti.open3d_loader import load_open3d
 
 
-def gaussians(count: int = 5, channels: int = 1) -> dict[str, np.ndarray]:
+def gaussians(count: int = 5, channels: int = 1) -> dict[str, Any]:
     random = np.random.default_rng(0)
     quats = random.normal(size=(count, 4))
     return {
@@ -46,6 +47,20 @@ def test_splat_file_is_the_3dgs_layout_to_the_byte(tmp_path: Path) -> None:
     assert row["f_dc_0"] == row["f_dc_1"] == row["f_dc_2"]
     assert 0.5 + 0.28209479177387814 * row["f_dc_0"] == pytest.approx(grey, abs=1e-6)
     assert row["rot_0"] == pytest.approx(gaussians(count=2)["quats"][0, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("degree", "count"), [(1, 9), (2, 24), (3, 45)])
+def test_higher_harmonics_are_zeros_in_the_order_that_readers_by_position_expect(
+    tmp_path: Path, degree: int, count: int
+) -> None:
+    path, written = tmp_path / "map.ply", gaussians()
+    write_gaussian_ply(path, **written, harmonics=degree)
+    header, body = path.read_bytes().split(b"end_header\n")
+    names = [line.split()[2].decode() for line in header.splitlines() if line.startswith(b"property float ")]
+    rest = [f"f_rest_{k}" for k in range(count)]
+    assert names == [*SPLAT_PROPERTIES[:9], *rest, *SPLAT_PROPERTIES[9:]]
+    assert not np.frombuffer(body, "<f4").reshape(5, -1)[:, 9 : 9 + count].any()
+    np.testing.assert_allclose(read_gaussian_ply(path)["quats"], written["quats"], atol=1e-6)
 
 
 def test_splat_file_is_a_point_cloud_to_open3d(tmp_path: Path) -> None:

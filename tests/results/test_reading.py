@@ -28,10 +28,19 @@ def test_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
         load_result(tmp_path / "absent")
 
 
-@pytest.mark.parametrize("name", ["points.ply", "mesh.ply", "metrics.json"])
-def test_broken_parts_of_a_result_are_named(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *[(name, b"garbage") for name in ("points.ply", "mesh.ply", "metrics.json")],
+        *[
+            ("metrics.json", damage)
+            for damage in (b"[" * 100_000, b"[1]", b"\xff", b'{"a": ' + b"9" * 9999 + b"}")
+        ],
+    ],
+)
+def test_broken_parts_of_a_result_are_named(tmp_path: Path, name: str, content: bytes) -> None:
     write_tum(curve(), tmp_path / "trajectory_tum.txt")
-    (tmp_path / name).write_bytes(b"garbage")
+    (tmp_path / name).write_bytes(content)
     with pytest.raises(DataError, match=name):
         load_result(tmp_path)
 

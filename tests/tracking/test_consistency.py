@@ -10,6 +10,7 @@ from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.altered import AlteredSequence
 from edslam_ti.datasets.base import WrappedSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
+from edslam_ti.events import Events
 from edslam_ti.tracking.consistency import Consistency
 
 pytestmark = pytest.mark.slow  # whole runs, or processes of their own
@@ -81,3 +82,13 @@ def test_depth_that_has_stopped_is_named(sequence: EventDepthSequence) -> None:
 def test_too_few_frames_give_no_result(sequence: EventDepthSequence) -> None:
     slam = tracked(sequence, samples(sequence)[:8])
     assert slam.tracker.consistency(slam.trajectory) is None
+
+
+def test_a_handful_of_events_contradicts_nothing(sequence: EventDepthSequence) -> None:
+    def thinned(events: Events) -> Events:
+        return Events.concatenate([events[:: max(1, len(events) // 3)], Events.empty()])
+
+    few = [replace(s, events=thinned(s.events)) for s in samples(sequence)]
+    slam = tracked(sequence, few)
+    found = slam.tracker.consistency(slam.trajectory)
+    assert found is None or found.problems == []

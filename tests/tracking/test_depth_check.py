@@ -1,6 +1,7 @@
 """When depth contradicts events: the limits, and whole runs with images of another time or of nothing."""
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,7 +11,14 @@ from sequences import ate_cm, make_slam, settings, tracked
 
 from edslam_ti.datasets import EventDepthSequence, Sample
 from edslam_ti.slam import Slam
-from edslam_ti.tracking.depth_check import MOST_IN_A_ROW, DepthCheck, is_contradiction, left_out, sets_to_try
+from edslam_ti.tracking.depth_check import (
+    MOST_IN_A_ROW,
+    DepthCheck,
+    is_contradiction,
+    left_out,
+    of_other_scale,
+    sets_to_try,
+)
 
 pytestmark = pytest.mark.slow  # whole runs, or processes of their own
 
@@ -69,7 +77,14 @@ def test_swapped_depth_images_are_left_out(
     assert all(r.converged for r in slam.results)
 
 
-@pytest.mark.parametrize("change", [lambda d: np.random.default_rng(0).permuted(d), lambda d: 1.1 * d])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: np.random.default_rng(0).permuted(d),
+        lambda d: 1.1 * d,
+        lambda d: np.where(d < np.percentile(d, 20), 10 * d, 0),  # the rest is out of range
+    ],
+)
 def test_a_frame_whose_depth_is_nonsense_has_its_pose_by_brightness(
     tiny_sequence: EventDepthSequence,
     tiny_samples: list[Sample],
@@ -83,6 +98,35 @@ def test_a_frame_whose_depth_is_nonsense_has_its_pose_by_brightness(
     assert distrusted(slam) == [9]
     assert slam.results[9].converged
     assert ate_cm(slam, tiny_sequence) < 0.2
+
+
+@pytest.mark.parametrize("factor", [10.0, 1.4, 0.5])
+def test_depth_of_another_scale_in_the_first_frame_is_left_out(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], factor: float
+) -> None:
+    samples = list(tiny_samples)
+    depth = samples[0].depth
+    assert depth is not None
+    nearby = np.where(depth < np.median(depth), depth, 0)  # the rest is out of a sensor's range
+    samples[0] = replace(samples[0], depth=(factor * nearby).astype(np.float32))
+    slam = tracked(tiny_sequence, samples)
+    assert distrusted(slam) == [0]
+    assert ate_cm(slam, tiny_sequence) < 0.3
+
+
+def test_frames_that_differ_in_scale_from_all_others_are_found() -> None:
+    def ratios(scales: list[float]) -> np.ndarray:
+        logs = np.log(scales)
+        return np.abs(logs[:, None] - logs)
+
+    assert of_other_scale(ratios([10, 1, 1.01, 1.02, 1])) == [0]
+    assert of_other_scale(ratios([1, 2, 1, 0.5, 1])) == [1, 3]
+    assert of_other_scale(ratios([1, 1.05, 1.1, 1.15, 1.2])) == []  # the view changes step by step
+    assert of_other_scale(ratios([2, 1, 1.2, 1, 1])) == []  # others do not agree
+    assert of_other_scale(ratios([2, 1])) == []  # nobody knows which
+    unknown = ratios([10, 1, 1, 1])
+    unknown[0] = math.nan
+    assert of_other_scale(unknown) == []
 
 
 def test_right_depth_is_kept(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
