@@ -23,9 +23,20 @@ class Offset:
 
 def clock_findings(offsets: Sequence[Offset]) -> list[Finding]:
     """Return a line for each stream that is off against the largest group that agrees."""
-    streams = [s for s in STREAMS if any(s in (o.late, o.against) for o in offsets)]
-    if len(streams) < 2:
-        return []
+    return [line for streams in _connected(offsets) for line in _of_connected(offsets, streams)]
+
+
+def _connected(offsets: Sequence[Offset]) -> list[list[str]]:
+    """Return the streams in groups within which there are offsets."""
+    groups = [{s} for s in STREAMS]
+    for offset in offsets:
+        joined = [g for g in groups if offset.late in g or offset.against in g]
+        groups = [g for g in groups if g not in joined] + [set().union(*joined)]
+    return [[s for s in STREAMS if s in group] for group in groups if len(group) > 1]
+
+
+def _of_connected(offsets: Sequence[Offset], streams: list[str]) -> list[Finding]:
+    offsets = [o for o in offsets if o.late in streams]
     lateness, deviation = _solved(offsets, streams)
     group = max(([b for b in streams if abs(lateness[a] - lateness[b]) < TOGETHER] for a in streams), key=len)
     reference = float(np.mean([lateness[s] for s in group]))

@@ -14,7 +14,7 @@ class Finding:
 FAULTS = (
     *("event_gap", "depth_gap", "hot_pixels", "one_polarity", "inverted_polarity", "bad_events"),
     *("swapped_axes", "mirrored_events", "unrelated_images", "mirrored_depth", "frozen_depth"),
-    *("depth_unit", "depth_elsewhere", "contradiction", "no_depth", "depth_coverage"),
+    *("depth_unit", "depth_elsewhere", "depth_turned", "refused", "no_depth", "depth_coverage"),
     *("truth_convention", "truth_scale", "truth_elsewhere", "truth_coverage", "truth_jumps"),
     *("depth_clock", "events_clock", "images_clock", "truth_clock"),
 )

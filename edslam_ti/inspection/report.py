@@ -7,7 +7,8 @@ import numpy as np
 
 from edslam_ti.config import Config, dataset_differences
 from edslam_ti.datasets import EventDepthSequence
-from edslam_ti.inspection.calibration import ShiftedDepth
+from edslam_ti.errors import DataError
+from edslam_ti.inspection.calibration import DepthCalibration, calibrate_depth
 from edslam_ti.inspection.clock_offsets import Offset, clock_findings
 from edslam_ti.inspection.edge_check import EdgeCheck, check_edges
 from edslam_ti.inspection.event_volume import EventVolume, liveliest_part
@@ -32,7 +33,8 @@ from edslam_ti.inspection.tracked import Tracked, track
 
 MOST_LOST = 0.1  # share of the frames
 CONTRADICTION = 12.0  # times the expected difference of poses; good recordings: up to 8.2
-SURE, SMALLEST_DELAY = 4.5, 0.008  # standard deviations, s
+SURE, SMALLEST_DELAY = 4.5, 0.004  # standard deviations, s
+SMALLEST_TURN = 0.5  # degrees
 RESOLVED = 0.5  # a delay explains a contradiction if at most this share of it remains without the delay
 STANDS_OUT, HIDDEN = 4.0, 1.7  # heights of a peak of depth edges in events: clear, and none
 # Faults with which tracking makes no sense.
@@ -82,10 +84,10 @@ def inspect(sequence: EventDepthSequence, config: Config, progress: Progress) ->
     offsets = _offsets(images, poses)
     if sequence.has_events and depth is not None and not is_certain:
         progress("tracking")
-        tracked, found, delay = _track(sequence, part, config, images, poses, edges)
+        tracked, found, delay = _track(sequence, part, config, images, poses, edges, progress)
         findings += found
         offsets += delay
-        if not found and tracked is not None and poses is not None and poses.is_good:
+        if delay and tracked is not None and poses is not None and poses.is_good:
             findings += fits_better(sequence, tracked.trajectory, poses, *part)
     if not any(f.fault in ("truth_elsewhere", "truth_convention") for f in findings):
         findings += clock_findings(offsets)
@@ -113,30 +115,47 @@ def _track(
     images: ImageCheck | None,
     poses: PoseCheck | None,
     edges: EdgeCheck | None,
+    progress: Progress,
 ) -> tuple[Tracked | None, list[Finding], list[Offset]]:
     """Return the tracked path, what events and depth contradict each other in, and the delay of depth."""
     tracked = track(sequence, *part, config)
     if tracked is None:
         return None, [], []
-    delay, first = 0.0, _misfit(tracked)
-    best = tracked
-    for _ in range(3):
-        step = _delay(best)
-        if step is None:
-            break
-        again = track(ShiftedDepth(sequence, delay + step), *part, config)
-        if again is None or _misfit(again) > _misfit(best):
-            break
-        delay, best = delay + step, again
-    misfit = _misfit(best)
-    if (misfit > CONTRADICTION and misfit > RESOLVED * first) or best.lost_share > MOST_LOST:
+    c = tracked.consistency
+    delay, found = 0.0, list[Finding]()
+    best, sigma = tracked, LATE_TRACKER if c is None else c.depth_delay_sigma_s
+    if _is_late(tracked) or _misfit(tracked) > CONTRADICTION:
+        progress("aligning depth with events")
+        try:
+            calibration = calibrate_depth(sequence, config, progress, part)
+            best, delay, sigma = calibration.tracked, calibration.delay, float(calibration.sigma[0])
+            found = _turned(calibration)
+        except DataError:  # too far off, or too little was compared
+            pass
+    if (_misfit(best) > CONTRADICTION and _misfit(best) > RESOLVED * _misfit(tracked)) or (
+        best.lost_share > MOST_LOST
+    ):
         is_good = images is not None and images.is_good, poses is not None and poses.is_good
         mirrored = _mirrored(sequence, part, config, best, *is_good)
         return tracked, [mirrored or _contradiction(best, edges)], []
-    c = best.consistency
-    if c is None:
+    if best.consistency is None:
         return tracked, [], []
-    return best, [], [Offset("depth", "events", delay, c.depth_delay_sigma_s + LATE_TRACKER)]
+    return best, found, [Offset("depth", "events", delay, sigma + LATE_TRACKER)]
+
+
+def _turned(calibration: DepthCalibration) -> list[Finding]:
+    """Return a line if depth is turned against the events by more than their noise could feign."""
+    angle = float(np.degrees(np.linalg.norm(calibration.rotation)))
+    is_needed = calibration.before > CONTRADICTION or calibration.after < RESOLVED * calibration.before
+    if angle < SMALLEST_TURN or not is_needed:
+        return []
+    return [
+        Finding(
+            "depth_turned",
+            f"depth does not lie quite where the events are: {calibration.text}: calibrate the two "
+            "cameras, or run with --calibrate depth",
+        )
+    ]
 
 
 def _misfit(tracked: Tracked) -> float:
@@ -146,12 +165,10 @@ def _misfit(tracked: Tracked) -> float:
     return float(np.sqrt(tracked.consistency.disagreement))
 
 
-def _delay(tracked: Tracked) -> float | None:
-    """Return the delay of depth (s) that the tracker is sure of."""
+def _is_late(tracked: Tracked) -> bool:
+    """Return whether the tracker is sure of a delay of depth."""
     c = tracked.consistency
-    if c is None or abs(c.depth_delay_s) < max(SURE * c.depth_delay_sigma_s, SMALLEST_DELAY / 2):
-        return None
-    return c.depth_delay_s
+    return c is not None and abs(c.depth_delay_s) > max(SURE * c.depth_delay_sigma_s, SMALLEST_DELAY)
 
 
 def _start(tracked: Tracked) -> str:

@@ -10,7 +10,7 @@ from edslam_ti.errors import DataError
 from edslam_ti.event_images.contrast import contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.slam import Slam
-from edslam_ti.tracking.consistency import Consistency
+from edslam_ti.tracking.consistency import Consistency, Misalignment
 from edslam_ti.tracking.image_tracker import BrightnessTracker
 from edslam_ti.trajectory import Trajectory
 
@@ -24,6 +24,7 @@ class Tracked:
     trajectory: Trajectory
     lost_share: float
     consistency: Consistency | None  # None: too few frames could be compared
+    misalignment: Misalignment | None  # the same
 
 
 def track(sequence: EventDepthSequence, start: float, end: float, config: Config) -> Tracked | None:
@@ -44,4 +45,5 @@ def track(sequence: EventDepthSequence, start: float, end: float, config: Config
         sample, _ = samples.as_far_as_readable(k)
         slam.process(sample)
     lost = float(np.mean([not result.converged for result in slam.results]))
-    return Tracked(slam.trajectory, lost, tracker.consistency(slam.trajectory))
+    path = slam.trajectory
+    return Tracked(path, lost, tracker.consistency(path), tracker.misalignment(path))
