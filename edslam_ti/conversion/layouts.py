@@ -15,6 +15,7 @@ import numpy as np
 from edslam_ti.conversion.events import ColumnWriter, RowWriter, slices
 from edslam_ti.conversion.pictures import depth_units, exact_scale, write_depth, write_grey
 from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.datasets.event_recording import EventRecording
 from edslam_ti.errors import DataError, plain
 from edslam_ti.output import atomic_folder, check_replaceable
 
@@ -161,13 +162,20 @@ class GenericWriter:
 
     def _write_descriptions(self) -> None:
         sequence, camera = self.sequence, self.sequence.camera
+        has_lens = not isinstance(sequence, EventRecording) or sequence.has_lens
+        names = ("width", "height", "fx", "fy", "cx", "cy") if has_lens else ("width", "height")
+        if not has_lens:
+            self.notes.append("the lens is not known: state fx, fy, cx and cy in camera.json (--intrinsics)")
+        if len(sequence.depth_timestamps) == 0:
+            self.notes.append("there is no depth: give depth.txt and depth/ (docs/my_camera.md) to run on it")
         values = {
-            **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+            **{name: getattr(camera, name) for name in names},
             "pixel_centres": "integer",
             "contrast_threshold": sequence.contrast_threshold,
             "depth_scale": self._scale,
             "exposure": sequence.exposure,
-            "preset": sequence.preset or (sequence.dataset if sequence.dataset not in LAYOUTS else None),
+            "preset": sequence.preset
+            or (sequence.dataset if sequence.dataset not in (*LAYOUTS, "events") else None),
             "time_offset": sequence.time_offset or None,
             "description": sequence.description,
         }

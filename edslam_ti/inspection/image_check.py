@@ -23,7 +23,7 @@ SHIFTS = np.arange(-0.12, 0.1201, 0.005)  # s
 EPSILON = 0.02  # added to brightness before the logarithm
 CLIP = 3.0  # standard deviations, so that hot pixels do not decide
 FITS, UNLIKE, CLEARLY = 0.45, 0.25, 2.0  # correlations: of a good reading, of a wrong one, and their ratio
-LAG = 0.06  # an event comes this share of the mean time between a pixel's events after the change, measured
+LAG = 0.09  # an event comes this share of the time between a pixel's events after the change, measured
 
 Transform = Callable[[np.ndarray], np.ndarray]  # [H, W] -> [H', W']
 
@@ -179,6 +179,7 @@ def _peak(values: np.ndarray) -> tuple[float, float]:
 
 
 def _time_between_events(volume: EventVolume) -> float:
-    """Return the mean time (s) between two events of a pixel."""
-    number = float(volume.number(volume.start, volume.end).sum()) / volume.factor**2
-    return (volume.end - volume.start) * volume.camera.width * volume.camera.height / max(number, 1.0)
+    """Return the mean time (s) between two events of a pixel, as an event sees it."""
+    number = volume.number(volume.start, volume.end) / volume.factor**2
+    total = float(number.sum())
+    return (volume.end - volume.start) * total / max(float((number * number).sum()), 1e-9) if total else 0.0

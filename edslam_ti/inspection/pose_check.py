@@ -24,6 +24,7 @@ POINTS = 1000  # of a depth image
 LARGEST = 0.1  # of the depth; larger differences count as this much
 LEAST_IN_VIEW, FEWEST = 0.2, 50  # share of the points, and number, that must land on depth
 FEWEST_PAIRS = 4
+NEARLY = 2.0  # times the cost of the tracked path, of poses that are right but read in another way
 MIRRORED = "mirrored in"  # how names of mirrored depth begin
 STATIC_SHARE, ALWAYS = 0.3, 0.05  # of the cost without motion, and a cost that is never held against poses
 BETTER = 0.6  # another reading must leave less than this share of the cost
@@ -147,7 +148,9 @@ def fits_better(
     distance = float(np.median(np.concatenate([p[:, 2] for p in seen.points.values()])))
     reading = better_reading(tracked.poses[known], true[known], max(1.0, distance))
     if reading is not None:
-        return [_convention(reading.looks, own, by_tracking)]
+        so_read = seen.costs(_reading(path.poses_at, reading.read), shift=-check.offset)
+        if np.nanmean(so_read) < NEARLY * np.nanmean(by_tracking) + ALWAYS:
+            return [_convention(reading.looks, own, so_read)]
     return [
         Finding(
             "truth_elsewhere",
@@ -180,6 +183,7 @@ def _better(seen: Reprojection, poses: Poses, own: np.ndarray) -> Finding | None
     }
     looks = min(fitting, key=lambda key: float(np.nanmean(fitting[key])), default="")
     is_scaled = abs(np.log(scale)) > SMALLEST_SCALE and _is_better(scaled, own, SCALE_BETTER)
+    is_scaled = is_scaled and bool(np.nanmean(scaled) < enough)
     if is_scaled and (not looks or np.nanmean(scaled) < np.nanmean(fitting[looks])):
         return _scale_finding(scale, own, scaled)
     if not looks:

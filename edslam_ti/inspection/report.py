@@ -34,14 +34,27 @@ from edslam_ti.inspection.tracked import Tracked, track
 MOST_LOST = 0.1  # share of the frames
 CONTRADICTION = 12.0  # times the expected difference of poses; good recordings: up to 8.2
 SURE, SMALLEST_DELAY = 4.5, 0.004  # standard deviations, s
-SMALLEST_TURN = 0.5  # degrees
+SMALLEST_TURN = 0.7  # degrees
 RESOLVED = 0.5  # a delay explains a contradiction if at most this share of it remains without the delay
 STANDS_OUT, HIDDEN = 4.0, 1.7  # heights of a peak of depth edges in events: clear, and none
 # Faults with which tracking makes no sense.
-CERTAIN = ("swapped_axes", "mirrored_events", "frozen_depth", "no_depth", "one_polarity")
+CERTAIN = ("swapped_axes", "mirrored_events", "mirrored_depth", "frozen_depth", "no_depth", "one_polarity")
 LATE_TRACKER = 0.004  # s, bias of the tracker's delay, besides its own deviation
 
 Progress = Callable[[str], None]  # receives what is being looked at
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What a recording is, and what looks wrong in it without tracking."""
+
+    part: tuple[float, float]  # s, looked at closely
+    events: EventFacts | None
+    depth: DepthFacts | None
+    images: ImageCheck | None
+    poses: PoseCheck | None
+    edges: EdgeCheck | None
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True)
@@ -49,12 +62,7 @@ class Report:
     """What a recording is, and what looks wrong in it."""
 
     sequence: EventDepthSequence
-    part: tuple[float, float]  # s, looked at closely
-    events: EventFacts | None
-    depth: DepthFacts | None
-    images: ImageCheck | None
-    poses: PoseCheck | None
-    edges: EdgeCheck | None
+    checks: Checks
     tracked: Tracked | None
     findings: tuple[Finding, ...]
 
@@ -62,41 +70,49 @@ class Report:
 def inspect(sequence: EventDepthSequence, config: Config, progress: Progress) -> Report:
     """Return a report on a recording; Taichi must have been started."""
     config = config.updated(dataset_differences(sequence.preset or sequence.dataset))
+    checks = check(sequence, progress)
+    findings, offsets = list(checks.findings), offsets_of(checks)
+    tracked, poses = None, checks.poses
+    is_certain = any(f.fault in CERTAIN for f in findings)
+    if sequence.has_events and checks.depth is not None and not is_certain:
+        progress("tracking")
+        tracked, found, delay = _track(sequence, config, checks, progress)
+        findings += found
+        offsets += delay
+        if delay and tracked is not None and poses is not None and poses.is_good:
+            findings += fits_better(sequence, tracked.trajectory, poses, *checks.part)
+    if not any(f.fault in ("truth_elsewhere", "truth_convention") for f in findings):
+        findings += clock_findings(offsets)
+    return Report(sequence, checks, tracked, tuple(findings))
+
+
+def check(sequence: EventDepthSequence, progress: Progress) -> Checks:
+    """Return what can be said of a recording without tracking."""
     progress("counting events")
     events, depth = event_facts(sequence), depth_facts(sequence)
     findings = [] if events is None else event_findings(sequence, events)
     findings += depth_findings(sequence, depth) + truth_findings(sequence)
     part = liveliest_part(sequence)
-    images = edges = tracked = None
+    images = poses = edges = None
     if sequence.has_events:
         volume = EventVolume(sequence, *part)
         progress("comparing events with images")
         images = check_images(sequence, volume)
         progress("comparing events with edges of depth")
         edges = check_edges(sequence, volume)
-    progress("comparing depth with true poses")
-    poses = check_poses(sequence, *part)
-    for check in (images, poses):
-        findings += [] if check is None else check.findings
-    if any(f.fault == "one_polarity" for f in findings):  # it explains that images do not fit
-        findings = [f for f in findings if f.fault != "unrelated_images"]
-    is_certain = any(f.fault in CERTAIN for f in findings)
-    offsets = _offsets(images, poses)
-    if sequence.has_events and depth is not None and not is_certain:
-        progress("tracking")
-        tracked, found, delay = _track(sequence, part, config, images, poses, edges, progress)
-        findings += found
-        offsets += delay
-        if delay and tracked is not None and poses is not None and poses.is_good:
-            findings += fits_better(sequence, tracked.trajectory, poses, *part)
-    if not any(f.fault in ("truth_elsewhere", "truth_convention") for f in findings):
-        findings += clock_findings(offsets)
-    return Report(sequence, part, events, depth, images, poses, edges, tracked, tuple(findings))
+    known = {f.fault for f in findings}
+    if images is not None and "one_polarity" not in known:  # which explains that images do not fit
+        findings += images.findings
+    if "frozen_depth" not in known:
+        progress("comparing depth with true poses")
+        poses = check_poses(sequence, *part)
+        findings += () if poses is None else poses.findings
+    return Checks(part, events, depth, images, poses, edges, tuple(findings))
 
 
-def _offsets(images: ImageCheck | None, poses: PoseCheck | None) -> list[Offset]:
+def offsets_of(checks: Checks) -> list[Offset]:
     """Return the offsets that images and true poses give."""
-    offsets = []
+    offsets, images, poses = [], checks.images, checks.poses
     if images is not None and images.is_good:
         offsets.append(Offset("events", "images", images.offset, images.tolerance / 2))
     if (
@@ -109,15 +125,10 @@ def _offsets(images: ImageCheck | None, poses: PoseCheck | None) -> list[Offset]
 
 
 def _track(
-    sequence: EventDepthSequence,
-    part: tuple[float, float],
-    config: Config,
-    images: ImageCheck | None,
-    poses: PoseCheck | None,
-    edges: EdgeCheck | None,
-    progress: Progress,
+    sequence: EventDepthSequence, config: Config, checks: Checks, progress: Progress
 ) -> tuple[Tracked | None, list[Finding], list[Offset]]:
     """Return the tracked path, what events and depth contradict each other in, and the delay of depth."""
+    part, images, poses = checks.part, checks.images, checks.poses
     tracked = track(sequence, *part, config)
     if tracked is None:
         return None, [], []
@@ -137,7 +148,7 @@ def _track(
     ):
         is_good = images is not None and images.is_good, poses is not None and poses.is_good
         mirrored = _mirrored(sequence, part, config, best, *is_good)
-        return tracked, [mirrored or _contradiction(best, edges)], []
+        return tracked, [mirrored or _contradiction(best, checks.edges)], []
     if best.consistency is None:
         return tracked, [], []
     return best, found, [Offset("depth", "events", delay, sigma + LATE_TRACKER)]

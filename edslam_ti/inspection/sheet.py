@@ -56,7 +56,7 @@ def write_sheet(report: Report, path: Path) -> None:
 def _times(report: Report) -> list[float]:
     """Return the times of the rows: those of depth images in the part that was looked at, if there are "
     "any."""
-    start, end = report.part
+    start, end = report.checks.part
     stamps = report.sequence.depth_timestamps
     stamps = stamps[(stamps >= start) & (stamps <= end)]
     if len(stamps) == 0:
@@ -72,7 +72,11 @@ def _row(sequence: EventDepthSequence, time: float, report: Report) -> Sequence[
     depth = sequence.depth_or_none(index) if has_depth else None
     image = sequence.image_at(time, tolerance=0.05)
     grey = None if image is None else _grey(image)
-    near, far = (report.depth.nearest, report.depth.farthest) if report.depth is not None else (0.0, 1.0)
+    near, far = (
+        (report.checks.depth.nearest, report.checks.depth.farthest)
+        if report.checks.depth is not None
+        else (0.0, 1.0)
+    )
     colours = None if depth is None else depth_colours(depth, near, far)
     background = events if events is not None else grey
     overlay = None if depth is None or background is None else _overlay(background, depth)

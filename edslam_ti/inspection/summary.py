@@ -6,6 +6,7 @@ from edslam_ti.datasets.base import stamp_text
 from edslam_ti.event_images.contrast import contrast_from_images
 from edslam_ti.inspection.findings import Finding
 from edslam_ti.inspection.report import Report
+from edslam_ti.inspection.streams import RATE_BIN
 
 
 def lines(report: Report | None, refusal: Finding | None) -> list[str]:
@@ -20,10 +21,13 @@ def lines(report: Report | None, refusal: Finding | None) -> list[str]:
 def _facts(report: Report) -> list[str]:
     sequence, camera = report.sequence, report.sequence.camera
     result = [f"{sequence.scene}: {sequence.description}, layout {sequence.dataset}"]
-    result.append(
-        f"camera: {camera.width}x{camera.height} pixels, fx {camera.fx:.6g}, fy {camera.fy:.6g}, cx "
-        f"{camera.cx:.6g}, cy {camera.cy:.6g}, undistorted"
-    )
+    lens = f"camera: {camera.width}x{camera.height} pixels, lens not known"
+    if sequence.dataset != "events":
+        lens = (
+            f"camera: {camera.width}x{camera.height} pixels, fx {camera.fx:.6g}, fy {camera.fy:.6g}, "
+            f"cx {camera.cx:.6g}, cy {camera.cy:.6g}, undistorted"
+        )
+    result.append(lens)
     result += _events(report) + _depth(report) + _images(report) + _truth(report)
     if sequence.imu is not None:
         result.append(f"IMU: {len(sequence.imu)} samples")
@@ -33,11 +37,11 @@ def _facts(report: Report) -> list[str]:
 
 
 def _events(report: Report) -> list[str]:
-    facts, sequence = report.events, report.sequence
+    facts, sequence = report.checks.events, report.sequence
     if facts is None:
         return ["events: none"]
     length = facts.end - facts.start
-    peak = float(facts.rates.max()) / 0.01
+    peak = max(float(facts.rates.max()) / RATE_BIN, facts.count / max(length, 1e-9))
     silent = float((facts.numbers == 0).mean())
     return [
         f"events: {facts.count} in {length:.6g} s ({stamp_text(sequence, facts.start)} to "
@@ -49,7 +53,7 @@ def _events(report: Report) -> list[str]:
 
 
 def _depth(report: Report) -> list[str]:
-    facts, stamps = report.depth, report.sequence.depth_timestamps
+    facts, stamps = report.checks.depth, report.sequence.depth_timestamps
     if facts is None:
         return ["depth: none"]
     return [
@@ -65,11 +69,11 @@ def _images(report: Report) -> list[str]:
         return ["images: none"]
     rate = 1 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     line = f"images: {len(stamps)} at {rate:.3g} Hz"
-    if report.images is not None:
-        line += f", changes correlate with those of the events at {report.images.correlation:.2f}"
+    if report.checks.images is not None:
+        line += f", changes correlate with those of the events at {report.checks.images.correlation:.2f}"
     result = [line]
     stated = sequence.contrast_threshold
-    estimate = contrast_from_images(sequence, *report.part) if sequence.has_events else None
+    estimate = contrast_from_images(sequence, *report.checks.part) if sequence.has_events else None
     said = [] if stated is None else [f"stated {stated:g}"]
     if estimate is not None:
         positive, negative = estimate.by_polarity
@@ -87,6 +91,6 @@ def _truth(report: Report) -> list[str]:
         f"true poses: {len(stamps)} at {rate:.4g} Hz ({stamp_text(sequence, stamps[0])} to "
         f"{stamp_text(sequence, stamps[-1])} s), path of {sequence.truth.length():.3g} m"
     )
-    if report.poses is not None:
-        line += f", depth reprojected with them is off by {10 * report.poses.cost:.1f} %"
+    if report.checks.poses is not None:
+        line += f", depth reprojected with them is off by {10 * report.checks.poses.cost:.1f} %"
     return [line]

@@ -22,6 +22,7 @@ from edslam_ti.trajectory import Trajectory
 
 MOST = 60  # frames that are compared, distributed over the run
 MIN_FRAMES = 6  # with fewer there is no result
+MIN_FOR_ROTATION = 12  # with fewer there is no result for a rotation of depth
 # Ratio of observed to expected squared disagreement, median over the frames. Simulated rooms: 9 to 46 without
 # a fault; 480 with depth 50 ms late, 910 with a focal length 10 % too long, 2800 with 20 pixels that fire at
 # 5 kHz.
@@ -142,6 +143,8 @@ class ConsistencyCheck:
     def misalignment(self, trajectory: Trajectory) -> Misalignment | None:
         """Return delay and rotation of depth; None: too few frames were compared.
 
+        The rotation is 0, its standard deviation infinite, where they are too few for it.
+
         If depth is turned by the small rotation w (E = exp(w)), depth alone measures the motion E^-1 X E, so
         that d = (Ad(X^-1) - 1) w besides the delay's part.
         """
@@ -155,7 +158,11 @@ class ConsistencyCheck:
             root = np.linalg.cholesky(c.information + 1e-9 * np.eye(6)).T
             design.append(root @ np.column_stack([change, (back - np.eye(6))[:, 3:]]))
             observed.append(root @ c.disagreement)
-        solution, sigma = _robust_solution(np.concatenate(design), np.concatenate(observed))
+        A, y = np.concatenate(design), np.concatenate(observed)
+        if len(self._comparisons) < MIN_FOR_ROTATION:
+            delay, sigma_delay = _robust_slope(A[:, 0], y)
+            return Misalignment(delay, np.zeros(3), np.array([sigma_delay, np.inf, np.inf, np.inf]))
+        solution, sigma = _robust_solution(A, y)
         return Misalignment(float(solution[0]), solution[1:], sigma)
 
 
