@@ -67,16 +67,13 @@ class DepthCalibration:
     def text(self) -> str:
         """One line for the log."""
         x, y, z = np.degrees(self.rotation)
-        turned = f"turned by {x:.2f}, {y:.2f}, {z:.2f} degrees about x, y, z"
-        if np.isfinite(self.sigma[1:]).all():
-            turned += f" (+- {np.degrees(self.sigma[1:].max()):.2f})"
-        else:
+        turned = f"turned by {x:.2f}, {y:.2f}, {z:.2f} deg (+- {np.degrees(self.sigma[1:].max()):.2f})"
+        if not np.isfinite(self.sigma[1:]).all():
             turned = "perhaps turned (too few frames to tell)"
+        late = "late" if self.delay >= 0 else "early"
         return (
-            f"depth is {1000 * abs(self.delay):.1f} ms (+- {1000 * self.sigma[0]:.1f}) "
-            f"{'late' if self.delay >= 0 else 'early'} and {turned} against the events; with this "
-            f"events and depth disagree {self.after:.1f} instead of {self.before:.1f} times the expected "
-            "difference"
+            f"depth is {1000 * abs(self.delay):.1f} ms (+- {1000 * self.sigma[0]:.1f}) {late} and {turned} "
+            f"against the events: {self.before:.1f} times the expected difference, corrected {self.after:.1f}"
         )
 
 

@@ -12,7 +12,7 @@ class Finding:
 
 
 FAULTS = (
-    *("event_gap", "depth_gap", "hot_pixels", "one_polarity", "inverted_polarity", "bad_events"),
+    *("event_gap", "depth_gap", "hot_pixels", "one_polarity", "inverted_polarity"),
     *("swapped_axes", "mirrored_events", "unrelated_images", "mirrored_depth", "frozen_depth"),
     *("depth_unit", "depth_elsewhere", "depth_turned", "refused", "no_depth", "depth_coverage"),
     *("truth_convention", "truth_scale", "truth_elsewhere", "truth_coverage", "truth_jumps"),
