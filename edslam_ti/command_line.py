@@ -84,13 +84,14 @@ def _settings_of(resumed: Path, file: Path | None, given: dict[str, Any]) -> Pat
 def with_presets(choices: Choices, configs: Path = CONFIGS) -> Config:
     """Return a run's settings; `configs` is the folder of <dataset>.yaml files.
 
-    Without --dataset it detects the format from the data folder, which loads torch.
+    Without --dataset it detects the format from the data folder, which loads torch. A recording in one of our
+    own layouts may state the data set whose settings fit it.
     """
     dataset = choices.config.dataset
-    if dataset is None:
-        from edslam_ti.datasets import find_sequence
+    if dataset in (None, "event_replica", "generic"):
+        from edslam_ti.datasets import preset_of
 
-        dataset, _ = find_sequence(choices.config)
+        dataset = preset_of(choices.config)
     values = merged(Config().model_dump(), dataset_differences(dataset, configs))
     values = merged(values, dict(METHODS[choices.config.method].overrides))
     return Config.validated(merged(values, choices.differences), source="command line")

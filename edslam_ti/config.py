@@ -232,6 +232,9 @@ class Config(Stage):
     detected from the files in the data folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
+    calibrate: Literal["none", "depth"] = "none"
+    """depth: estimate a small delay and rotation between depth and events from the data, and correct them
+    (docs/my_camera.md). The log says what was found."""
     depth_dir: Path | None = None
     """Folder with depth images to use instead of the recording's own, or where it has none (docs/data.md)."""
     crop: bool = False

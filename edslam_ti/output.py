@@ -128,12 +128,13 @@ def _replace_in_two_steps(new: Path, path: Path, why_keep: WhyKeep | None) -> No
     shutil.rmtree(old)
 
 
-def write_npy_header(file: BinaryIO, dtype: np.dtype, num_rows: int, num_columns: int) -> None:
-    """Write the header of an array [num_rows, num_columns] at the start of a .npy file.
+def write_npy_header(file: BinaryIO, dtype: np.dtype, num_rows: int, num_columns: int | None) -> None:
+    """Write the header of an array [num_rows, num_columns], None: [num_rows], at the start of a .npy file.
 
     Append rows after it. NumPy pads the header, so a later call with the true number of rows takes the same
     space.
     """
     file.seek(0)
-    header = {"descr": dtype.str, "fortran_order": False, "shape": (num_rows, num_columns)}
+    shape = (num_rows,) if num_columns is None else (num_rows, num_columns)
+    header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(file, header)

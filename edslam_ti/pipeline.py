@@ -26,6 +26,7 @@ from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.identity import compare, identity_of
+from edslam_ti.inspection.calibration import aligned, calibrate_depth
 from edslam_ti.interruption import Interruption, Stopped, signals_handled
 from edslam_ti.journal import JOURNAL, Journal
 from edslam_ti.mapping.mapper import Mapper
@@ -139,6 +140,8 @@ def _prepare(config: Config, console: Console, open_with: Opener) -> tuple[Viewe
     if config.mapping.enabled and config.evaluation.lpips_weights is not None:
         load_lpips(config.evaluation.lpips_weights)  # is it there, and what it should be?
     sequence = open_with(config, console)
+    if config.calibrate == "depth":
+        sequence = _with_calibrated_depth(sequence, config, console)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     contrast = contrast_of(config, sequence, samples)
     slam = make_slam(config, sequence, samples, contrast)
@@ -160,6 +163,15 @@ def _prepare(config: Config, console: Console, open_with: Opener) -> tuple[Viewe
     if config.mapping.enabled:
         _check_truth_of_views(state, console)
     return viewer, state
+
+
+def _with_calibrated_depth(
+    sequence: EventDepthSequence, config: Config, console: Console
+) -> EventDepthSequence:
+    """Return the sequence with depth moved to where events show it; say by how much."""
+    calibration = calibrate_depth(sequence, config, lambda what: say(console, what))
+    sequence.note(f"calibrated: {calibration.text}")
+    return aligned(sequence, calibration.delay, calibration.rotation)
 
 
 def _check_truth_of_views(state: Run, console: Console) -> None:

@@ -21,6 +21,7 @@ import yaml
 from rich.console import Console
 from sequences import make_slam, settings, tracked
 
+from edslam_ti.commands import COMMANDS
 from edslam_ti.config import Config, MappingConfig
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence, open_sequence
 from edslam_ti.errors import DataError
@@ -250,14 +251,14 @@ def options(command: str) -> str:
     name, *subcommand = command.split()
     output = io.StringIO()
     with redirect_stdout(output), pytest.raises(SystemExit):
-        import_module(f"apps.{name}").main([*subcommand, "--help"])
+        import_module(f"edslam_ti.commands.{name}").main([*subcommand, "--help"])
     return output.getvalue()
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_commands_parse(document: Path) -> None:
     for name, *words in commands(document):
-        assert (ROOT / "apps" / f"{name}.py").is_file(), f"{document.name}: no command {name}"
+        assert name in COMMANDS, f"{document.name}: no command {name}"
         command = f"{name} {words[0]}" if name == "reproduce" and words else name
         for word in words:
             if word.startswith("--") and word != "--help":

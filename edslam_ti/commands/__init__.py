@@ -12,6 +12,8 @@ COMMANDS = {
     "slam": "track an event camera and build a 3D Gaussian map",
     "view": "show finished runs in a window, or draw them into a picture",
     "evaluate": "compare two trajectories, and a mesh with the true surfaces",
+    "inspect": "check a recording: numbers, a picture, and what looks wrong in it",
+    "convert": "write a recording in another layout, to the bit",
     "simulate": "write a simulated recording",
     "reproduce": "measure over many recordings: tracking, ablations, long_stream, report",
     "benchmark": "time the kernels against alternatives",

@@ -19,9 +19,11 @@ from typing import NamedTuple
 
 from edslam_ti.config import Config
 from edslam_ti.datasets.base import EventDepthSequence, Sample, SampledSequence, WrappedSequence
+from edslam_ti.datasets.camera_file import read_camera
 from edslam_ti.datasets.dsec import DsecSequence, is_dsec
 from edslam_ti.datasets.event_replica import EventReplicaSequence, is_event_replica
 from edslam_ti.datasets.evslam import EvslamSequence, is_evslam
+from edslam_ti.datasets.generic import GenericSequence, is_generic
 from edslam_ti.datasets.m3ed import M3edSequence, is_m3ed
 from edslam_ti.datasets.mvsec import MvsecSequence, is_mvsec
 from edslam_ti.datasets.other_depth import OtherDepth
@@ -29,7 +31,7 @@ from edslam_ti.datasets.rgbd import RgbdSequence, is_rgbd
 from edslam_ti.datasets.rpg import RpgSequence, is_rpg
 from edslam_ti.datasets.tum_vie import TumVieSequence, is_tum_vie
 from edslam_ti.datasets.vector import VectorSequence, is_vector
-from edslam_ti.errors import ConfigError
+from edslam_ti.errors import ConfigError, plain
 
 __all__ = [
     "FORMATS",
@@ -40,7 +42,9 @@ __all__ = [
     "SampledSequence",
     "WrappedSequence",
     "find_sequence",
+    "open_folder",
     "open_sequence",
+    "preset_of",
 ]
 
 
@@ -93,6 +97,11 @@ FORMATS: dict[str, Format] = {
             config.depth_dir is None,
         ),
         is_event_replica,
+    ),
+    "generic": Format(
+        "generic layout, with camera.json and events.* or depth.txt",
+        lambda folder, config: GenericSequence(folder),
+        is_generic,
     ),
     "rpg": Format(
         "RPG Event Camera Dataset's layout, with events.txt",
@@ -164,6 +173,18 @@ def find_sequence(config: Config) -> Found:
     raise _not_found(config, FORMATS)
 
 
+def preset_of(config: Config) -> str:
+    """Return the data set whose settings fit the scene that the settings name; raises as `find_sequence`.
+
+    It is the scene's own, unless its camera.json states another one.
+    """
+    found = find_sequence(config)
+    stated = found.folder / "camera.json" if found.folder is not None else None
+    if found.dataset in ("event_replica", "generic") and stated is not None and stated.is_file():
+        return read_camera(stated).preset or found.dataset
+    return found.dataset
+
+
 def open_sequence(config: Config) -> EventDepthSequence:
     """Open the scene that the settings name; a built-in one is simulated on first use (Taichi must run).
 
@@ -185,6 +206,24 @@ def open_sequence(config: Config) -> EventDepthSequence:
     if config.crop and found.dataset != "vector":
         raise ConfigError(f"crop: expected with vector alone, got it with {found.dataset}; leave it out")
     return sequence if config.depth_dir is None else OtherDepth(sequence, config.depth_dir)
+
+
+def open_folder(folder: Path, config: Config) -> EventDepthSequence:
+    """Open the recording in a folder, in the layout that the settings name, else in the one it looks like.
+
+    Raises what `open_sequence` raises.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{plain(folder, 400)}: expected the folder of a recording, found no such folder")
+    if config.dataset is not None and config.dataset not in FORMATS:
+        _find_in(config, config.dataset)  # raises, naming the nearest
+    names = [name for name, format in FORMATS.items() if format.detect(folder)]
+    if config.dataset is None and len(names) > 1:
+        raise ConfigError(f"{folder}: looks like {' and like '.join(names)}; choose one with --dataset")
+    if config.dataset is None and not names:
+        known = "; ".join(f"{name} ({f.description})" for name, f in FORMATS.items() if not f.scenes())
+        raise ConfigError(f"{folder}: in no known layout; expected one of {known}")
+    return FORMATS[config.dataset or names[0]].open(folder, config)
 
 
 def _find_in(config: Config, dataset: str) -> Found:

@@ -61,6 +61,7 @@ class EventDepthSequence(ABC):
     depth_timestamps: np.ndarray  # [D] seconds, strictly increasing
     image_timestamps: np.ndarray  # [I] seconds, strictly increasing; may be empty
     exposure: float | None = None  # seconds over which an image integrates, when the data states it
+    preset: str | None = None  # data set whose settings fit the recording; None: those of its own layout
     description: str  # one line about the recording; a stand-in must say that it is one
     surfaces_file: Path | None = None  # true surfaces of a simulated scene, a PLY mesh; for evaluation only
     has_events: bool = True

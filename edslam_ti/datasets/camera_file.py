@@ -49,6 +49,10 @@ class CameraFile(BaseModel):
     """Seconds over which an image integrates, centred on its time; 0: sharp."""
     frame_rate: float = Field(30.0, ge=1e-3, le=1e5)
     """Images per second, for layouts whose files have a number but no time (not EventReplica's)."""
+    time_offset: float = Field(0.0, ge=-1e11, le=1e11)
+    """Seconds to add to every stamp of the files for the recording's own clock (event_replica, generic)."""
+    preset: str | None = Field(None, pattern=r"^[a-z0-9_]{1,40}$")
+    """Data set whose settings (configs/<preset>.yaml) fit the recording (event_replica, generic)."""
     distortion_model: str = Field("plumb_bob", max_length=40)
     """plumb_bob (k1 k2 p1 p2 k3), rational (also k4 k5 k6) or equidistant (k1 k2 k3 k4), OpenCV's."""
     distortion: list[float] = Field([], max_length=8)

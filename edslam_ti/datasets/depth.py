@@ -7,7 +7,6 @@ PNG: "no measurement" or "beyond the range", 65504 in half floats), 10 km and mo
 nothing is hit), and the value that camera.json states as `invalid`.
 """
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,8 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.datasets.base import EventDepthSequence, has_variation
-from edslam_ti.datasets.files import check_size, decode, file_bytes, quiet
+from edslam_ti.datasets.exr import read_exr
+from edslam_ti.datasets.files import decode
 from edslam_ti.errors import DataError
 
 FARTHEST_DEPTH = 1e4  # m
@@ -39,7 +39,7 @@ def read_depth(path: Path, camera: Camera, format: DepthFormat) -> np.ndarray:  
     Raises `FileNotFoundError`, and `DataError` if the file is no depth image of the camera's size.
     """
     if path.suffix.lower() == ".exr":
-        depth = _decode_exr(path, camera)
+        depth = read_exr(path, camera)
         with np.errstate(invalid="ignore"):
             is_measured = (depth > 0) & (depth < FARTHEST_DEPTH)  # False for NaN
         if format.invalid is not None:
@@ -56,39 +56,6 @@ def read_depth(path: Path, camera: Camera, format: DepthFormat) -> np.ndarray:  
         is_missing |= raw == format.invalid
     depth[is_missing] = 0
     return depth
-
-
-def _decode_exr(path: Path, camera: Camera) -> np.ndarray:  # [H, W] float32
-    """Return the depth channel of an OpenEXR file (OpenCV's wheels no longer read the format)."""
-    import OpenEXR
-
-    data = file_bytes(path, "depth image")
-    try:
-        path.name.encode()
-        source: str | io.BytesIO = str(path)
-    except UnicodeEncodeError:  # OpenEXR takes only names in UTF-8
-        source = io.BytesIO(data)
-    try:
-        with quiet():
-            (left, top), (right, bottom) = OpenEXR.File(source, header_only=True).header()["dataWindow"]
-            shape = (int(bottom) - int(top) + 1, int(right) - int(left) + 1)
-        check_size(path, shape, camera, "depth")  # before allocating: a few bytes may claim gigabytes
-        if isinstance(source, io.BytesIO):
-            source.seek(0)
-        with quiet(), OpenEXR.File(source, separate_channels=True) as file, np.errstate(all="ignore"):
-            channels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
-    except DataError:
-        raise
-    except (RuntimeError, ValueError, TypeError, KeyError, OverflowError, MemoryError) as error:
-        raise DataError(f"{path}: not readable as OpenEXR ({' '.join(str(error).split())})") from error
-    for wanted in ("Z", "V", "Y", "R"):  # R: renderers that repeat depth in R, G and B
-        for name, pixels in channels.items():
-            if name.split(".")[-1] == wanted:
-                check_size(path, pixels.shape, camera, "depth")
-                return pixels
-    if len(channels) == 1:
-        return next(iter(channels.values()))
-    raise DataError(f"{path}: expected a channel Z, V, Y or R with depth, got {', '.join(sorted(channels))}")
 
 
 def look_at_images(sequence: EventDepthSequence, folder: Path) -> None:

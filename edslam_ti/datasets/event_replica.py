@@ -2,7 +2,7 @@
 
     poses_ts.txt                               one time a line, seconds            } both or neither
     traj.txt                                   16 numbers a line, T_world_camera   }
-    images/frameNNNNNN.{jpg,png}               grey or colour, optional
+    images/frameNNNNNN.{jpg,png,exr}           grey or colour, optional; OpenEXR: brightness 0 to 1
     event_threshold_<C>/gray_events_data.npy   (N, 4): x, y, t [s], p
     depth/frameNNNNNN.png                      16 bits, 1/depth_scale metres, 0 = missing; or
     Depth_exr/*.exr                            metres (used when there is no depth/frame*.png)
@@ -25,6 +25,7 @@ depth.py says which values count as missing.
 Clock: the files' own, in seconds; a late one is shifted (clocks.py), and `time_offset` holds the shift.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +34,10 @@ from edslam_ti.datasets.base import EventDepthSequence, NovelView, stamp_text
 from edslam_ti.datasets.camera_file import CameraFile, read_camera
 from edslam_ti.datasets.clocks import check_clock, check_milliseconds, clock_offset, note_coverage
 from edslam_ti.datasets.depth import look_at_images, read_depth
-from edslam_ti.datasets.files import numbered_files, read_image, read_timestamps
-from edslam_ti.datasets.truth import read_poses, read_timed_poses
+from edslam_ti.datasets.exr import read_grey
+from edslam_ti.datasets.files import numbered_files, read_timestamps
+from edslam_ti.datasets.novel_views import read_novel_views
+from edslam_ti.datasets.truth import read_timed_poses
 from edslam_ti.errors import DataError, plain
 from edslam_ti.event_files.checked import EventFile
 from edslam_ti.events import Events
@@ -76,7 +79,7 @@ class EventReplicaSequence(EventDepthSequence):
         except DataError as error:
             raise DataError(f"{folder / 'camera.json'}: {error}") from error
         self._depth_is_undistorted = calibration.depth_undistorted
-        self.exposure = calibration.exposure
+        self.exposure, self.preset = calibration.exposure, calibration.preset
         self._depth_format = calibration.depth_format()
         events_folder, self.contrast_threshold = _event_folder(
             folder, contrast_threshold, calibration.contrast_threshold
@@ -86,9 +89,10 @@ class EventReplicaSequence(EventDepthSequence):
         for note in self._events.notes:
             self.note(f"{self._events.path}: {note}")
 
-        self.time_offset = clock_offset(self._events.time_range[0])
-        if self.time_offset:
-            self._events = self._events.shifted(self.time_offset)
+        self._shift = clock_offset(self._events.time_range[0])  # s, of the files' stamps
+        self.time_offset = self._shift + calibration.time_offset
+        if self._shift:
+            self._events = self._events.shifted(self._shift)
 
         self._read_images(calibration, depth_rate, image_rate, needs_depth)
         self.truth = self._read_truth(folder)
@@ -108,7 +112,7 @@ class EventReplicaSequence(EventDepthSequence):
         return self._undistorted_depth(read_depth(self._depth_files[index], self.camera, self._depth_format))
 
     def image(self, index: int) -> np.ndarray:  # [H, W] float32 in [0, 1]
-        return self._undistorted_image(read_image(self._image_files[index], self.camera))
+        return self._undistorted_image(read_grey(self._image_files[index], self.camera))
 
     def _undistorted_image(self, image: np.ndarray) -> np.ndarray:  # [H, W]
         return image if self._undistortion is None else self._undistortion.image(image)
@@ -119,24 +123,10 @@ class EventReplicaSequence(EventDepthSequence):
         return self._undistortion.depth(depth)
 
     def novel_views(self) -> list[NovelView]:
-        folder = self._folder / "novel_views"
-        if not folder.is_dir():
-            return []
-        images, depths = (numbered_files(folder / name, "frame*", (".png",)) for name in ("images", "depth"))
-        poses, _ = read_poses(folder / "traj.txt")
-        if list(images) != list(depths) or len(images) != len(poses):
-            raise DataError(
-                f"{folder}: expected an image, a depth image of the same name and a pose for every view, got "
-                f"{len(images)} images, {len(depths)} depth images and {len(poses)} poses"
-            )
+        views = read_novel_views(self._folder, self.camera, self._depth_format, self._shift)
         return [
-            NovelView(
-                ms / 1000 - self.time_offset,
-                self._undistorted_image(read_image(images[ms], self.camera)),
-                self._undistorted_depth(read_depth(depths[ms], self.camera, self._depth_format)),
-                T,
-            )
-            for ms, T in zip(images, poses)
+            replace(v, image=self._undistorted_image(v.image), depth=self._undistorted_depth(v.depth))
+            for v in views
         ]
 
     def _read_images(
@@ -162,7 +152,7 @@ class EventReplicaSequence(EventDepthSequence):
         if depth:
             note_coverage(self)
         image_folder = self._folder / "images"
-        images = numbered_files(image_folder, "frame*", (".jpg", ".jpeg", ".png"))
+        images = numbered_files(image_folder, "frame*", (".jpg", ".jpeg", ".png", ".exr"))
         image_rate = image_rate or calibration.image_rate
         if rate and not image_rate and images and list(images) == list(depth):
             image_rate = rate
@@ -175,11 +165,11 @@ class EventReplicaSequence(EventDepthSequence):
         self, folder: Path, files: dict[int, Path], rate: float | None, key: str
     ) -> tuple[list[Path], np.ndarray]:
         """Return the files and their times (s): from timestamps.txt, a rate, or milliseconds in names."""
-        numbers, offset = list(files), int(self.time_offset)
+        numbers, offset = list(files), int(self._shift)
         name = f"{folder.name} (ms in the file names)"
         if (folder / "timestamps.txt").is_file():
             name = f"{folder.name}/timestamps.txt"
-            times = read_timestamps(folder / "timestamps.txt", files) - self.time_offset
+            times = read_timestamps(folder / "timestamps.txt", files) - self._shift
         elif rate:
             name = f"{folder.name} (at {rate:g} Hz)"
             first = self.time_range[0]
@@ -211,7 +201,7 @@ class EventReplicaSequence(EventDepthSequence):
         truth, notes = read_timed_poses(times_file, poses_file)
         for text in notes:
             self.note(text)
-        return Trajectory(truth.timestamps - self.time_offset, truth.poses)
+        return Trajectory(truth.timestamps - self._shift, truth.poses)
 
 
 def _event_folder(folder: Path, wanted: float | None, stated: float | None) -> tuple[Path, float | None]:

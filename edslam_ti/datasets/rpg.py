@@ -133,4 +133,5 @@ def _depth_files(folder: Path, num_times: int, needs_depth: bool) -> tuple[dict[
 
 def is_rpg(folder: Path) -> bool:
     """Return whether a folder holds events where this layout has them."""
-    return (folder / "events.txt").is_file()
+    is_generic = (folder / "depth.txt").is_file() and not (folder / "calib.txt").is_file()
+    return (folder / "events.txt").is_file() and not is_generic

@@ -9,15 +9,23 @@ from edslam_ti.geometry import orthonormalized
 from edslam_ti.tables import read_table
 from edslam_ti.trajectory import Trajectory, in_order
 
+ROUNDING = 4e-15  # of R R^T; a matrix written with fewer than 15 digits differs by more
 MATRIX = "the 4x4 matrix T_world_camera, row by row"
 
 
 def read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:  # [F, 4, 4], [F] lines of the file
-    """Return the matrices of a file with 16 numbers a line, rotations orthonormal to rounding."""
+    """Return the matrices of a file with 16 numbers a line, rotations orthonormal to rounding.
+
+    Matrices that are so already stay as they are, to the bit.
+    """
     table = read_table(path, 16, MATRIX)
     poses = table.rows.reshape(-1, 4, 4)
     check_rigid(poses, path, table.lines)
-    return np.array([orthonormalized(T) for T in poses]), table.lines
+    return np.array([T if _is_exact(T[:3, :3]) else orthonormalized(T) for T in poses]), table.lines
+
+
+def _is_exact(R: np.ndarray) -> bool:  # [3, 3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < ROUNDING)
 
 
 def read_timed_poses(times_file: Path, poses_file: Path) -> tuple[Trajectory, list[str]]:

@@ -60,7 +60,7 @@ def run_case(
     """
     recording = case.recording
     config = Config(method=variant.method, scene=recording.scene, seed=recording.seed, threads=threads)
-    config = config.updated(dataset_differences(sequence.dataset))
+    config = config.updated(dataset_differences(sequence.preset or sequence.dataset))
     config = config.updated(dict(METHODS[variant.method].overrides)).updated(variant.differences)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
     slam = make_slam(config, sequence, samples, contrast_of(config, sequence, samples))

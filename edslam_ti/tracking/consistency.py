@@ -22,6 +22,7 @@ from edslam_ti.trajectory import Trajectory
 
 MOST = 60  # frames that are compared, distributed over the run
 MIN_FRAMES = 6  # with fewer there is no result
+MIN_FOR_ROTATION = 12  # with fewer there is no result for a rotation of depth
 # Ratio of observed to expected squared disagreement, median over the frames. Simulated rooms: 9 to 46 without
 # a fault; 480 with depth 50 ms late, 910 with a focal length 10 % too long, 2800 with 20 pixels that fire at
 # 5 kHz.
@@ -33,6 +34,7 @@ SURE, SMALLEST_DELAY = 4.5, 0.004
 # events 0.09, one or two hundred events in all 0.01: where events are few, brightness seems even.
 SMALLEST_SCALE = 0.1
 HUBER = 1.5  # standard deviations
+WORST_CONDITION = 1e12  # of the equations for delay and rotation: beyond, the motion does not tell them
 FROZEN_SHARE = 0.2  # depth has stopped if this share of the compared frames repeats the previous depth image
 
 
@@ -69,6 +71,15 @@ class Consistency:
                 "registration of depth to the event camera, noisy pixels, and whether events are missing"
             )
         return lines
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """A delay and a rotation between depth and events that explain how their poses differ."""
+
+    delay_s: float  # by which depth images show an earlier time than their stamps
+    rotation: np.ndarray  # [3] rad, rotation vector of the depth camera in the event camera's frame
+    sigma: np.ndarray  # [4] s, rad, rad, rad
 
 
 @dataclass(frozen=True)
@@ -129,12 +140,53 @@ class ConsistencyCheck:
         repeated = float(np.mean([c.is_repeated for c in self._comparisons]))
         return Consistency(len(squares), float(np.median(squares)), delay, sigma, repeated)
 
+    def misalignment(self, trajectory: Trajectory) -> Misalignment | None:
+        """Return delay and rotation of depth; None: too few frames were compared.
+
+        The rotation is 0, its standard deviation infinite, where they are too few for it.
+
+        If depth is turned by the small rotation w (E = exp(w)), depth alone measures the motion E^-1 X E, so
+        that d = (Ad(X^-1) - 1) w besides the delay's part.
+        """
+        if len(self._comparisons) < MIN_FRAMES:
+            return None
+        design, observed = [], []
+        for c in self._comparisons:
+            X = inverse(trajectory.pose(c.keyframe)) @ trajectory.pose(c.index)
+            back = adjoint(inverse(X))
+            change = _velocity(trajectory, c.index) - back @ _velocity(trajectory, c.keyframe)
+            root = np.linalg.cholesky(c.information + 1e-9 * np.eye(6)).T
+            design.append(root @ np.column_stack([change, (back - np.eye(6))[:, 3:]]))
+            observed.append(root @ c.disagreement)
+        A, y = np.concatenate(design), np.concatenate(observed)
+        if len(self._comparisons) < MIN_FOR_ROTATION:
+            delay, sigma_delay = _robust_slope(A[:, 0], y)
+            return Misalignment(delay, np.zeros(3), np.array([sigma_delay, np.inf, np.inf, np.inf]))
+        solution, sigma = _robust_solution(A, y)
+        return Misalignment(float(solution[0]), solution[1:], sigma)
+
 
 def _velocity(trajectory: Trajectory, index: int) -> np.ndarray:  # [6]
     """Return the velocity of the body around a frame, metres and radians per second."""
     a, b = max(index - 1, 0), min(index + 1, len(trajectory) - 1)
     stamps = trajectory.timestamps
     return np.asarray(se3_log(inverse(trajectory.pose(a)) @ trajectory.pose(b)) / (stamps[b] - stamps[a]))
+
+
+def _robust_solution(A: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [N, K], [N]
+    """Return x [K] in y = A x, and its standard deviations, by iteratively reweighted least squares "
+    "(Huber)."""
+    weight, x, sigma = np.ones(len(y)), np.zeros(A.shape[1]), np.full(A.shape[1], np.inf)
+    for _ in range(10):
+        information = (A * weight[:, None]).T @ A
+        if np.linalg.cond(information) > WORST_CONDITION:
+            return np.zeros(A.shape[1]), np.full(A.shape[1], np.inf)
+        x = np.linalg.solve(information, A.T @ (weight * y))
+        residual = y - A @ x
+        scale = 1.48 * float(np.median(np.abs(residual))) + 1e-9
+        weight = 1 / np.maximum(1, np.abs(residual) / (HUBER * scale))
+        sigma = scale * np.sqrt(np.diag(np.linalg.inv(information)))
+    return x, sigma
 
 
 def _robust_slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:  # [N], [N]

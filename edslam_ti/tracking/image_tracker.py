@@ -26,7 +26,7 @@ from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.noisy import NoisyPixels
 from edslam_ti.frame import Frame
 from edslam_ti.geometry import inverse
-from edslam_ti.tracking.consistency import Consistency, ConsistencyCheck
+from edslam_ti.tracking.consistency import Consistency, ConsistencyCheck, Misalignment
 from edslam_ti.tracking.depth_check import FITS, OTHER_SCALE, UNUSUAL, DepthCheck, left_out, log_ratio
 from edslam_ti.tracking.first_image import first_image
 from edslam_ti.tracking.gaps import EventRate, bridge
@@ -152,6 +152,10 @@ class BrightnessTracker:
     def consistency(self, trajectory: Trajectory) -> Consistency | None:
         """Return whether events and depth told the same motion; None: too little was compared."""
         return self._check.result(trajectory)
+
+    def misalignment(self, trajectory: Trajectory) -> Misalignment | None:
+        """Return the delay and the rotation of depth that explain how its poses differ; None: too few."""
+        return self._check.misalignment(trajectory)
 
     def _note_on_depth(self, frame: Frame) -> str:
         """Return, once, that few pixels have depth."""

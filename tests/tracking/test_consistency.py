@@ -2,15 +2,18 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from sequences import record_tiny_room, tracked
 
 from edslam_ti.camera import Camera
+from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence
 from edslam_ti.datasets.altered import AlteredSequence
 from edslam_ti.datasets.base import WrappedSequence
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.events import Events
+from edslam_ti.inspection.calibration import ShiftedDepth, TurnedDepth, calibrate_depth
 from edslam_ti.tracking.consistency import Consistency
 
 pytestmark = pytest.mark.slow  # whole runs, or processes of their own
@@ -92,3 +95,12 @@ def test_a_handful_of_events_contradicts_nothing(sequence: EventDepthSequence) -
     slam = tracked(sequence, few)
     found = slam.tracker.consistency(slam.trajectory)
     assert found is None or found.problems == []
+
+
+def test_a_rotation_of_depth_is_found_and_taken_back(sequence: EventDepthSequence) -> None:
+    rotation = np.radians([0.0, 0.0, 1.5])
+    spoiled = ShiftedDepth(TurnedDepth(sequence, -rotation), -0.015)
+    found = calibrate_depth(spoiled, Config(), lambda what: None)
+    assert found.delay == pytest.approx(0.015, abs=0.003)
+    assert np.degrees(found.rotation - rotation) == pytest.approx(np.zeros(3), abs=0.5)
+    assert found.after < 0.5 * found.before
