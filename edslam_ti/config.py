@@ -219,6 +219,29 @@ class MappingConfig(Stage):
     """Adam's learning rate of poses, metres and radians."""
 
 
+class DepthEventVoConfig(Stage):
+    """Method depth_event_vo (Zuo et al. 2022); its time surface has its settings in `time_surface`."""
+
+    num_points: int = Field(3000, ge=200)
+    """Semi-dense points of a keyframe (the authors' later Canny-EVT: at most 3000)."""
+    min_time_surface: float = Field(0.6, gt=0, lt=1)
+    """Points are chosen where the time surface exceeds this, at edges."""
+    surfaces_per_frame: int = Field(5, ge=1)
+    """Time surfaces aligned one after the other for each frame (authors: 10 a depth image at 30 Hz)."""
+    iterations: int = Field(10, ge=1)
+    """At most this many steps for each time surface (Canny-EVT: 10)."""
+    huber_threshold: float = Field(0.2, gt=0)
+    """Potentials beyond this count linearly (Canny-EVT: 50 of 255)."""
+    keyframe_distance: float = Field(0.05, gt=0)
+    """A keyframe is replaced when the camera has moved this far, as a share of its median depth."""
+    min_overlap: float = Field(0.8, gt=0, lt=1)
+    """So it is with less than this share of its points in view."""
+    min_support: float = Field(0.5, gt=0, lt=1)
+    """With a smaller share of points on edges of the time surface, tracking has failed."""
+    voxel_size: float = Field(0.01, gt=0)
+    """Metres, of the map's voxels, which hold a point each."""
+
+
 class EvaluationConfig(Stage):
     """Image metrics at poses held out from mapping."""
 
@@ -279,6 +302,7 @@ class Config(Stage):
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
+    depth_event_vo: DepthEventVoConfig = DepthEventVoConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 
     def updated(self, differences: dict[str, Any]) -> Self:

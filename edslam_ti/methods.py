@@ -25,14 +25,18 @@ class Method:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _ed_slam(
-    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
-) -> tuple["Tracker", "Mapper"]:
+def _require_events(sequence: "EventDepthSequence", config: "Config") -> None:
     if not sequence.has_events:
         raise DataError(
             f"{sequence.scene}: method {config.method} needs events, and this sequence has none; use "
             "--method open3d_rgbd or open3d_icp"
         )
+
+
+def _ed_slam(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
     from edslam_ti.event_images.sharp import SharpImages
     from edslam_ti.mapping.gaussian_mapper import GaussianMapper
     from edslam_ti.tracking.image_tracker import BrightnessTracker
@@ -73,6 +77,20 @@ def _kiss_icp(
     return KissIcpTracker(sequence.camera), TsdfMapper(sequence.camera)
 
 
+def _depth_event_vo(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
+    from edslam_ti.baselines.depth_event_vo import DepthEventTracker
+    from edslam_ti.baselines.semi_dense import SemiDenseMapper
+
+    camera, surfaces, settings = sequence.camera, config.time_surface, config.depth_event_vo
+    return (
+        DepthEventTracker(camera, surfaces, settings, config.seed, config.device),
+        SemiDenseMapper(camera, surfaces, settings, config.seed),
+    )
+
+
 METHODS: dict[str, Method] = {
     "ed_slam": Method(
         "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
@@ -81,6 +99,11 @@ METHODS: dict[str, Method] = {
         "Eq. 5 to the letter: time surfaces alone, consecutive frames, both directions",
         _ed_slam,
         {"tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0}},
+    ),
+    "depth_event_vo": Method(
+        "Zuo et al. 2022: semi-dense points fall into the negated time surface, map of edges",
+        _depth_event_vo,
+        {"time_surface": {"blur": 0.7}},  # a wider one shifts the bottom of the field
     ),
     "open3d_rgbd": Method(
         "Open3D's RGB-D odometry and TSDF volume; needs images, uses no events", _open3d_rgbd

@@ -73,6 +73,7 @@ ORDERS: dict[str, list[str]] = {
         *("gaussian_ply", "gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion"),
         *("keyframes", "densification", "recolouring", "targets", "poses", "gaussian_mapper"),
     ],
+    "baselines": ["open3d_rgbd", "kiss", "depth_event_vo", "semi_dense"],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
