@@ -219,6 +219,36 @@ class MappingConfig(Stage):
     """Adam's learning rate of poses, metres and radians."""
 
 
+class ChangeConfig(Stage):
+    """Windows of events of the mappers that compare two renders: ed_slam_paper, event_3dgs, inc_event_gs."""
+
+    knots_per_frame: int = Field(5, ge=1)
+    """Moments in each frame's chunk at which windows may begin and end."""
+    min_window: float = Field(0.2, gt=0)
+    """Fewest events of a window, per pixel (IncEventGS: 80,000 events of 768 x 480 pixels)."""
+    max_window: float = Field(1.1, gt=0)
+    """Most events of a window, per pixel (IncEventGS: 400,100 events)."""
+    solve_views: int = Field(20, ge=0)
+    """Views from which brightness is solved for at once (mapping/brightness_solve.py); 0: never."""
+    solve_every: int = Field(8, ge=1)
+    """Frames between two such solves during the run."""
+    solve_iterations: int = Field(60, ge=1)
+    """Iterations of conjugate gradients of a solve."""
+
+
+class EventOnlyConfig(Stage):
+    """Maps without depth: event_3dgs and inc_event_gs."""
+
+    nearest: float = Field(0.5, gt=0)
+    """Metres; new Gaussians get a random depth from here on."""
+    farthest: float = Field(6.0, gt=0)
+    """Metres; up to here."""
+    solve_steps: int = Field(100, ge=1)
+    """Final steps between two solves of all brightness."""
+    min_opacity: float = Field(0.02, ge=0, lt=1)
+    """Gaussians that fade below this during the final steps are removed."""
+
+
 class DepthEventVoConfig(Stage):
     """Method depth_event_vo (Zuo et al. 2022); its time surface has its settings in `time_surface`."""
 
@@ -302,6 +332,8 @@ class Config(Stage):
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
+    change: ChangeConfig = ChangeConfig()
+    event_only: EventOnlyConfig = EventOnlyConfig()
     depth_event_vo: DepthEventVoConfig = DepthEventVoConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 

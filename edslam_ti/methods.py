@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from edslam_ti.errors import DataError
+from edslam_ti.errors import ConfigError, DataError
 
 if TYPE_CHECKING:  # `--help` must not load Taichi or Open3D
     from edslam_ti.config import Config
@@ -48,6 +48,10 @@ def _ed_slam(
         tracker = BrightnessTracker(sequence.camera, contrast, surfaces, tracking, config.seed)
     else:
         tracker = BidirectionalPatchTracker(sequence.camera, surfaces, tracking, config.seed)
+    if config.method == "ed_slam_paper":
+        from edslam_ti.mapping.paper_mapper import PaperMapper
+
+        return tracker, PaperMapper(sequence.camera, contrast, config)
     sharp_images = SharpImages(sequence, contrast, config.mapping) if config.mapping.frames else None
     return tracker, GaussianMapper(sequence.camera, contrast, config, sharp_images)
 
@@ -77,6 +81,18 @@ def _kiss_icp(
     return KissIcpTracker(sequence.camera), TsdfMapper(sequence.camera)
 
 
+def _event_3dgs(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
+    if config.poses != "truth":
+        raise ConfigError("poses: method event_3dgs maps with known poses; use --poses truth")
+    from edslam_ti.mapping.event_only_mapper import EventOnlyMapper
+    from edslam_ti.tracking.tracker import TruePoses
+
+    return TruePoses(sequence.true_pose), EventOnlyMapper(sequence.camera, contrast, config)
+
+
 def _depth_event_vo(
     sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
@@ -96,9 +112,24 @@ METHODS: dict[str, Method] = {
         "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
     ),
     "ed_slam_paper": Method(
-        "Eq. 5 to the letter: time surfaces alone, consecutive frames, both directions",
+        "the paper to the letter: time surfaces alone (Eq. 5), map from the change between two renders",
         _ed_slam,
-        {"tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0}},
+        {
+            "tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0},
+            "mapping": {"event_weight": 0.7, "scale_weight": 0.25, "depth_weight": 0.05},  # Sec. IV-A
+        },
+    ),
+    "event_3dgs": Method(
+        "Event3DGS as re-implemented for comparison: true poses, events alone, Gaussians at random depth",
+        _event_3dgs,
+        {
+            "poses": "truth",
+            "change": {"min_window": 1.0, "max_window": 60.0},
+            "mapping": {
+                **{"initial_size": 0.8, "initial_opacity": 0.5, "background": 0.4, "means_rate": 0.005},
+                **{"iterations": 2, "final_iterations": 1500, "max_gaussians": 100_000},
+            },
+        },
     ),
     "depth_event_vo": Method(
         "Zuo et al. 2022: semi-dense points fall into the negated time surface, map of edges",
