@@ -249,6 +249,25 @@ class EventOnlyConfig(Stage):
     """Gaussians that fade below this during the final steps are removed."""
 
 
+class IncEventGsConfig(Stage):
+    """Method inc_event_gs (Huang et al. 2025)."""
+
+    bootstrap_frames: int = Field(6, ge=3)
+    """Chunks over which map and poses are found together (authors: 3 in the paper, 5 in their code)."""
+    bootstrap_steps: int = Field(400, ge=1)
+    """Steps of the bootstrap (authors: 3501)."""
+    tracking_steps: int = Field(40, ge=1)
+    """Adam steps for each chunk's pose (authors: 201)."""
+    tracking_rate: float = Field(2e-3, gt=0)
+    """Their learning rate, metres and radians (authors: 1e-4)."""
+    adjust_every: int = Field(2, ge=1)
+    """Chunks between two sliding bundle adjustments (authors: 2)."""
+    window: int = Field(20, ge=2)
+    """Chunks that a sliding bundle adjustment covers (authors: 20)."""
+    min_explained: float = Field(0.4, gt=0, lt=1)
+    """With a smaller share of the change explained by the map, tracking has failed."""
+
+
 class DepthEventVoConfig(Stage):
     """Method depth_event_vo (Zuo et al. 2022); its time surface has its settings in `time_surface`."""
 
@@ -334,6 +353,7 @@ class Config(Stage):
     mapping: MappingConfig = MappingConfig()
     change: ChangeConfig = ChangeConfig()
     event_only: EventOnlyConfig = EventOnlyConfig()
+    inc_event_gs: IncEventGsConfig = IncEventGsConfig()
     depth_event_vo: DepthEventVoConfig = DepthEventVoConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 

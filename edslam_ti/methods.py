@@ -93,6 +93,18 @@ def _event_3dgs(
     return TruePoses(sequence.true_pose), EventOnlyMapper(sequence.camera, contrast, config)
 
 
+def _inc_event_gs(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
+    if not config.mapping.enabled:
+        raise ConfigError("mapping.enabled: method inc_event_gs tracks by its map and cannot run without")
+    from edslam_ti.baselines.inc_event_gs import IncEventMapper, IncEventTracker
+
+    mapper = IncEventMapper(sequence.camera, contrast, config)
+    return IncEventTracker(mapper, config.inc_event_gs), mapper
+
+
 def _depth_event_vo(
     sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
 ) -> tuple["Tracker", "Mapper"]:
@@ -117,6 +129,17 @@ METHODS: dict[str, Method] = {
         {
             "tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0},
             "mapping": {"event_weight": 0.7, "scale_weight": 0.25, "depth_weight": 0.05},  # Sec. IV-A
+        },
+    ),
+    "inc_event_gs": Method(
+        "IncEventGS: poses and map from events alone, by the change between two renders; no scale",
+        _inc_event_gs,
+        {
+            "mapping": {
+                **{"initial_size": 0.8, "initial_opacity": 0.5, "background": 0.4, "means_rate": 0.005},
+                **{"iterations": 15, "final_iterations": 1000, "max_gaussians": 100_000},
+                **{"poses_rate": 2e-4},
+            },
         },
     ),
     "event_3dgs": Method(

@@ -26,6 +26,7 @@ STATE_MODULES = (
     *("edslam_ti.slam", "edslam_ti.trajectory", "edslam_ti.frame", "edslam_ti.events", "edslam_ti.camera"),
     *("edslam_ti.tracking.", "edslam_ti.mapping.", "edslam_ti.event_images."),
     *("edslam_ti.kernels.patch_warp", "edslam_ti.baselines.depth_event_vo", "edslam_ti.baselines.semi_dense"),
+    "edslam_ti.baselines.inc_event_gs",
 )
 PLAIN = (type(None), bool, int, float, str)  # JSON holds them exactly
 

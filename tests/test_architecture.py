@@ -74,7 +74,7 @@ ORDERS: dict[str, list[str]] = {
         *("keyframes", "densification", "recolouring", "targets", "poses", "shown_map", "gaussian_mapper"),
         *("change_loss", "brightness_solve", "change_mapper", "paper_mapper", "event_only_mapper"),
     ],
-    "baselines": ["open3d_rgbd", "kiss", "depth_event_vo", "semi_dense"],
+    "baselines": ["open3d_rgbd", "kiss", "depth_event_vo", "semi_dense", "inc_event_gs"],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),

@@ -88,7 +88,7 @@ class ChangeMapper(ShownMap):
             rate = LAST_RATE**done
             self.gaussians.decay_rates(rate)
             self._refiner.rate = self._config.poses_rate * rate
-            free = range(len(trajectory)) if self._adjusts_poses and done >= ADJUST_FROM else None
+            free = range(len(trajectory)) if self._poses_are_free(done) else None
             self._final_step(self._num_final, trajectory, free)
             self._num_final += 1
             if not progress(self._num_final / total):
@@ -96,6 +96,10 @@ class ChangeMapper(ShownMap):
         prune_faded(self.gaussians, self._config.min_opacity)
         self._num_final = None
         self.budget.stop()
+
+    def _poses_are_free(self, done: float) -> bool:
+        """Return whether the final steps move poses when a share of them is done: the map comes first."""
+        return self._adjusts_poses and done >= ADJUST_FROM
 
     def _begin_final(self, trajectory: Trajectory) -> None:
         """Prepare the final steps."""
