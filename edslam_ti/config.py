@@ -209,6 +209,78 @@ class MappingConfig(Stage):
     """Adam's learning rate of poses, metres and radians."""
 
 
+class ChangeConfig(Stage):
+    """Windows of events of the mappers that compare two renders: ed_slam_paper, event_3dgs, inc_event_gs."""
+
+    knots_per_frame: int = Field(5, ge=1)
+    """Moments in each frame's chunk at which windows may begin and end."""
+    min_window: float = Field(0.2, gt=0)
+    """Fewest events of a window, per pixel (IncEventGS: 80,000 events of 768 x 480 pixels)."""
+    max_window: float = Field(1.1, gt=0)
+    """Most events of a window, per pixel (IncEventGS: 400,100 events)."""
+    solve_views: int = Field(20, ge=0)
+    """Views from which brightness is solved for at once (mapping/brightness_solve.py); 0: never."""
+    solve_every: int = Field(8, ge=1)
+    """Frames between two such solves during the run."""
+    solve_iterations: int = Field(60, ge=1)
+    """Iterations of conjugate gradients of a solve."""
+
+
+class EventOnlyConfig(Stage):
+    """Maps without depth: event_3dgs and inc_event_gs."""
+
+    nearest: float = Field(0.5, gt=0)
+    """Metres; new Gaussians get a random depth from here on."""
+    farthest: float = Field(6.0, gt=0)
+    """Metres; up to here."""
+    solve_steps: int = Field(100, ge=1)
+    """Final steps between two solves of all brightness."""
+    min_opacity: float = Field(0.02, ge=0, lt=1)
+    """Gaussians that fade below this during the final steps are removed."""
+
+
+class IncEventGsConfig(Stage):
+    """Method inc_event_gs (Huang et al. 2025)."""
+
+    bootstrap_frames: int = Field(6, ge=3)
+    """Chunks over which map and poses are found together (authors: 3 in the paper, 5 in their code)."""
+    bootstrap_steps: int = Field(400, ge=1)
+    """Steps of the bootstrap (authors: 3501)."""
+    tracking_steps: int = Field(40, ge=1)
+    """Adam steps for each chunk's pose (authors: 201)."""
+    tracking_rate: float = Field(2e-3, gt=0)
+    """Their learning rate, metres and radians (authors: 1e-4)."""
+    adjust_every: int = Field(2, ge=1)
+    """Chunks between two sliding bundle adjustments (authors: 2)."""
+    window: int = Field(20, ge=2)
+    """Chunks that a sliding bundle adjustment covers (authors: 20)."""
+    min_explained: float = Field(0.4, gt=0, lt=1)
+    """With a smaller share of the change explained by the map, tracking has failed."""
+
+
+class DepthEventVoConfig(Stage):
+    """Method depth_event_vo (Zuo et al. 2022); its time surface has its settings in `time_surface`."""
+
+    num_points: int = Field(3000, ge=200)
+    """Semi-dense points of a keyframe (the authors' later Canny-EVT: at most 3000)."""
+    min_time_surface: float = Field(0.6, gt=0, lt=1)
+    """Points are chosen where the time surface exceeds this, at edges."""
+    surfaces_per_frame: int = Field(5, ge=1)
+    """Time surfaces aligned one after the other for each frame (authors: 10 a depth image at 30 Hz)."""
+    iterations: int = Field(10, ge=1)
+    """At most this many steps for each time surface (Canny-EVT: 10)."""
+    huber_threshold: float = Field(0.2, gt=0)
+    """Potentials beyond this count linearly (Canny-EVT: 50 of 255)."""
+    keyframe_distance: float = Field(0.05, gt=0)
+    """A keyframe is replaced when the camera has moved this far, as a share of its median depth."""
+    min_overlap: float = Field(0.8, gt=0, lt=1)
+    """So it is with less than this share of its points in view."""
+    min_support: float = Field(0.5, gt=0, lt=1)
+    """With a smaller share of points on edges of the time surface, tracking has failed."""
+    voxel_size: float = Field(0.01, gt=0)
+    """Metres, of the map's voxels, which hold a point each."""
+
+
 class EvaluationConfig(Stage):
     """Image metrics at poses held out from mapping."""
 
@@ -276,6 +348,10 @@ class Config(Stage):
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
+    change: ChangeConfig = ChangeConfig()
+    event_only: EventOnlyConfig = EventOnlyConfig()
+    inc_event_gs: IncEventGsConfig = IncEventGsConfig()
+    depth_event_vo: DepthEventVoConfig = DepthEventVoConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     small_gicp: SmallGicpConfig = SmallGicpConfig()
     splatam: SplatamConfig = SplatamConfig()

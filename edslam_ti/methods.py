@@ -25,14 +25,18 @@ class Method:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _ed_slam(
-    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
-) -> tuple["Tracker", "Mapper"]:
+def _require_events(sequence: "EventDepthSequence", config: "Config") -> None:
     if not sequence.has_events:
         raise DataError(
             f"{sequence.scene}: method {config.method} needs events, and this sequence has none; use "
             "--method open3d_rgbd or open3d_icp"
         )
+
+
+def _ed_slam(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
     from edslam_ti.event_images.sharp import SharpImages
     from edslam_ti.mapping.gaussian_mapper import GaussianMapper
     from edslam_ti.tracking.image_tracker import BrightnessTracker
@@ -44,6 +48,10 @@ def _ed_slam(
         tracker = BrightnessTracker(sequence.camera, contrast, surfaces, tracking, config.seed)
     else:
         tracker = BidirectionalPatchTracker(sequence.camera, surfaces, tracking, config.seed)
+    if config.method == "ed_slam_paper":
+        from edslam_ti.mapping.paper_mapper import PaperMapper
+
+        return tracker, PaperMapper(sequence.camera, contrast, config)
     sharp_images = SharpImages(sequence, contrast, config.mapping) if config.mapping.frames else None
     return tracker, GaussianMapper(sequence.camera, contrast, config, sharp_images)
 
@@ -98,14 +106,83 @@ def _splatam(
     return SplatamTracker(sequence.camera, mapper.map, config.splatam), mapper
 
 
+def _event_3dgs(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
+    if config.poses != "truth":
+        raise ConfigError("poses: method event_3dgs maps with known poses; use --poses truth")
+    from edslam_ti.mapping.event_only_mapper import EventOnlyMapper
+    from edslam_ti.tracking.tracker import TruePoses
+
+    return TruePoses(sequence.true_pose), EventOnlyMapper(sequence.camera, contrast, config)
+
+
+def _inc_event_gs(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
+    if not config.mapping.enabled:
+        raise ConfigError("mapping.enabled: method inc_event_gs tracks by its map and cannot run without")
+    from edslam_ti.baselines.inc_event_gs import IncEventMapper, IncEventTracker
+
+    mapper = IncEventMapper(sequence.camera, contrast, config)
+    return IncEventTracker(mapper, config.inc_event_gs), mapper
+
+
+def _depth_event_vo(
+    sequence: "EventDepthSequence", contrast: "ContrastThreshold", config: "Config"
+) -> tuple["Tracker", "Mapper"]:
+    _require_events(sequence, config)
+    from edslam_ti.baselines.depth_event_vo import DepthEventTracker
+    from edslam_ti.baselines.semi_dense import SemiDenseMapper
+
+    camera, surfaces, settings = sequence.camera, config.time_surface, config.depth_event_vo
+    return (
+        DepthEventTracker(camera, surfaces, settings, config.seed, config.device),
+        SemiDenseMapper(camera, surfaces, settings, config.seed),
+    )
+
+
 METHODS: dict[str, Method] = {
     "ed_slam": Method(
         "time surface and depth aligned together, Gaussian map from events and depth", _ed_slam
     ),
     "ed_slam_paper": Method(
-        "Eq. 5 to the letter: time surfaces alone, consecutive frames, both directions",
+        "the paper to the letter: time surfaces alone (Eq. 5), map from the change between two renders",
         _ed_slam,
-        {"tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0}},
+        {
+            "tracking": {"brightness": False, "references": "previous", "depth_weight": 0.0},
+            "mapping": {"event_weight": 0.7, "scale_weight": 0.25, "depth_weight": 0.05},  # Sec. IV-A
+        },
+    ),
+    "inc_event_gs": Method(
+        "IncEventGS: poses and map from events alone, by the change between two renders; no scale",
+        _inc_event_gs,
+        {
+            "mapping": {
+                **{"initial_size": 0.8, "initial_opacity": 0.5, "background": 0.4, "means_rate": 0.005},
+                **{"iterations": 15, "final_iterations": 1000, "max_gaussians": 100_000},
+                **{"poses_rate": 2e-4},
+            },
+        },
+    ),
+    "event_3dgs": Method(
+        "Event3DGS as re-implemented for comparison: true poses, events alone, Gaussians at random depth",
+        _event_3dgs,
+        {
+            "poses": "truth",
+            "change": {"min_window": 1.0, "max_window": 60.0},
+            "mapping": {
+                **{"initial_size": 0.8, "initial_opacity": 0.5, "background": 0.4, "means_rate": 0.005},
+                **{"iterations": 2, "final_iterations": 1500, "max_gaussians": 100_000},
+            },
+        },
+    ),
+    "depth_event_vo": Method(
+        "Zuo et al. 2022: semi-dense points fall into the negated time surface, map of edges",
+        _depth_event_vo,
+        {"time_surface": {"blur": 0.7}},  # a wider one shifts the bottom of the field
     ),
     "open3d_rgbd": Method(
         "Open3D's RGB-D odometry and TSDF volume; needs images, uses no events", _open3d_rgbd

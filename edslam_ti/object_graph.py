@@ -27,6 +27,8 @@ STATE_MODULES = (
     *("edslam_ti.tracking.", "edslam_ti.mapping.", "edslam_ti.event_images."),
     "edslam_ti.kernels.patch_warp",
     *("edslam_ti.baselines.gicp", "edslam_ti.baselines.splatam."),
+    *("edslam_ti.baselines.depth_event_vo", "edslam_ti.baselines.semi_dense"),
+    "edslam_ti.baselines.inc_event_gs",
 )
 PLAIN = (type(None), bool, int, float, str)  # JSON holds them exactly
 

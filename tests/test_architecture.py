@@ -59,7 +59,7 @@ ORDERS: dict[str, list[str]] = {
         *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
         "command_line",
     ],
-    "event_images": ["change", "noisy", "solve", "contrast", "sharp"],
+    "event_images": ["change", "noisy", "sums", "solve", "contrast", "sharp"],
     "tracking": [
         *(
             "consistency",
@@ -79,7 +79,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "mapping": [
         *("gaussian_ply", "gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion"),
-        *("keyframes", "densification", "recolouring", "targets", "poses", "gaussian_mapper"),
+        *("keyframes", "densification", "recolouring", "targets", "poses", "shown_map", "gaussian_mapper"),
+        *("change_loss", "brightness_solve", "change_mapper", "paper_mapper", "event_only_mapper"),
     ],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,15 +15,14 @@ from edslam_ti.frame import Frame
 from edslam_ti.geometry import is_near
 from edslam_ti.mapping.budget import Budget, prune_faded
 from edslam_ti.mapping.densification import Densifier, scene_size
-from edslam_ti.mapping.gaussian_ply import write_gaussian_ply
-from edslam_ti.mapping.gaussians import GaussianMap
 from edslam_ti.mapping.insertion import new_gaussians
 from edslam_ti.mapping.keyframes import Keyframe, covisibility, is_keyframe
 from edslam_ti.mapping.losses import map_loss
 from edslam_ti.mapping.mapper import Progress
 from edslam_ti.mapping.poses import MapAligner, PoseMemory, PoseRefiner, StepPose
 from edslam_ti.mapping.recolouring import recolour
-from edslam_ti.mapping.rendering import RenderOutput, View, drawable, render_map, render_view
+from edslam_ti.mapping.rendering import RenderOutput, drawable
+from edslam_ti.mapping.shown_map import ShownMap
 from edslam_ti.mapping.targets import EventImages, FrameSampler, evenly
 from edslam_ti.trajectory import Trajectory
 
@@ -49,7 +47,7 @@ class Refinement:
     done: float = 0.0  # share of the final steps, or of the budget
 
 
-class GaussianMapper:
+class GaussianMapper(ShownMap):
     """Places Gaussians at measured depth and optimises them, and the poses, to explain the events.
 
     Eq. 10 to 12 with t_k at the beginning of a window of some seconds. The image at t_k is unknown but the
@@ -65,14 +63,12 @@ class GaussianMapper:
         config: Config,
         sharp_images: SharpImages | None = None,
     ) -> None:
-        self.gaussians = GaussianMap(config.mapping)
+        super().__init__(camera, config.mapping)
         self.keyframes: list[Keyframe] = []
         self.images = EventImages(camera, contrast, config.mapping, sharp_images)
         self.budget = Budget(config.mapping.budget)
         self.loss = float("nan")  # running mean of the event loss
         self.num_steps = 0  # taken so far
-        self._camera = camera
-        self._config = config.mapping
         self._keyframe_config = config.keyframes
         self._random = np.random.default_rng(config.seed + 1)
         self._sampler = FrameSampler(self._random, config.keyframes.num_chunks)
@@ -84,10 +80,6 @@ class GaussianMapper:
         self._refinement: Refinement | None = None  # None: not refining
         self._num_frames = 0
         self._num_supervised = 0  # frames that the map has been optimised for, including dropped ones
-
-    @property
-    def num_gaussians(self) -> int:
-        return len(self.gaussians)
 
     # --- the loop ---
 
@@ -181,22 +173,6 @@ class GaussianMapper:
 
     # --- what the map shows ---
 
-    def render(self, camera: Camera, T_world_camera: np.ndarray, measured_only: bool = False) -> View:
-        """Return the map seen from a pose; `measured_only`: without Gaussians at assumed depth."""
-        gaussians = self.gaussians.measured() if measured_only else self.gaussians
-        return render_view(gaussians, camera, T_world_camera, self._config.background)
-
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Gaussians' centres and brightness."""
-        with torch.no_grad():
-            gaussians = self.gaussians.activated()
-        return gaussians.means.detach().numpy(), gaussians.colors.numpy()[:, 0]
-
-    @property
-    def map(self) -> GaussianMap:
-        """The Gaussians."""
-        return self.gaussians
-
     def keyframe_indices(self) -> list[int]:
         """Return the frames chosen as keyframes."""
         return [keyframe.index for keyframe in self.keyframes]
@@ -208,23 +184,6 @@ class GaussianMapper:
             "num_mapping_steps": self.num_steps,
             "num_hot_pixels": int(self.images.noisy_pixels.mask.sum()),
         }
-
-    def save(self, folder: Path) -> None:
-        """Write map.ply, the Gaussians in the layout of 3D Gaussian splatting."""
-        raw = {name: value.detach().numpy() for name, value in self.gaussians.raw.items()}
-        colors = self.gaussians.activated().colors.detach().numpy()
-        write_gaussian_ply(
-            folder / "map.ply",
-            raw["means"],
-            raw["quats"],
-            raw["log_scales"],
-            raw["logit_opacities"],
-            colors,
-            self._config.ply_harmonics,
-        )
-
-    def _view(self, T_world_camera: np.ndarray) -> RenderOutput:  # [4, 4]
-        return render_map(self.gaussians, self._camera, T_world_camera, self._config.background)
 
     # --- growing ---
 

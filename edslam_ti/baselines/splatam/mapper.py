@@ -54,6 +54,7 @@ class SplatamMapper:
         self.num_steps = 0  # taken so far
         self._gaussians = IsotropicMap()
         self._config = config.splatam.mapping
+        self._ply_harmonics = config.mapping.ply_harmonics
         self._scale = Scale(camera, self._config.image_width, self._gaussians.device)
         self._rays = self._scale.rays()
         self._similarity = Similarity(*self._scale.camera.shape, self._gaussians.device)
@@ -131,7 +132,13 @@ class SplatamMapper:
         quats = no_rotation(torch.from_numpy(log_scales)).numpy()
         colors = np.clip(raw["colors"], 0, 1)
         write_gaussian_ply(
-            folder / "map.ply", raw["means"], quats, log_scales, raw["logit_opacities"], colors
+            folder / "map.ply",
+            raw["means"],
+            quats,
+            log_scales,
+            raw["logit_opacities"],
+            colors,
+            self._ply_harmonics,
         )
 
     # --- growing ---
