@@ -32,9 +32,11 @@ from edslam_ti.inspection.streams import (
 from edslam_ti.inspection.tracked import Tracked, track
 
 MOST_LOST = 0.1  # share of the frames
-CONTRADICTION = 12.0  # times the expected difference of poses; good recordings: up to 8.2
+# Times the expected difference of poses by depth and by brightness: of good recordings up to 8.2, and up to
+# 5.6 after the delay and the rotation that suit them best are taken back.
+SUSPICIOUS, CONTRADICTION = 6.0, 8.0
 SURE, SMALLEST_DELAY = 4.5, 0.004  # standard deviations, s
-SMALLEST_TURN = 0.7  # degrees
+SMALLEST_TURN, TURNED = 0.7, 0.6  # degrees; share of the misfit that remains if depth is turned back
 RESOLVED = 0.5  # a delay explains a contradiction if at most this share of it remains without the delay
 STANDS_OUT, HIDDEN = 4.0, 1.7  # heights of a peak of depth edges in events: clear, and none
 # Faults with which tracking makes no sense.
@@ -135,12 +137,12 @@ def _track(
     c = tracked.consistency
     delay, found = 0.0, list[Finding]()
     best, sigma = tracked, LATE_TRACKER if c is None else c.depth_delay_sigma_s
-    if _is_late(tracked) or _misfit(tracked) > CONTRADICTION:
+    if _is_late(tracked) or _misfit(tracked) > SUSPICIOUS:
         progress("aligning depth with events")
         try:
             calibration = calibrate_depth(sequence, config, progress, part)
             best, delay, sigma = calibration.tracked, calibration.delay, float(calibration.sigma[0])
-            found = _turned(calibration)
+            found = _turned(calibration, float(np.degrees(1 / sequence.camera.fx)))
         except DataError:  # too far off, or too little was compared
             pass
     if (_misfit(best) > CONTRADICTION and _misfit(best) > RESOLVED * _misfit(tracked)) or (
@@ -154,11 +156,11 @@ def _track(
     return best, found, [Offset("depth", "events", delay, sigma + LATE_TRACKER)]
 
 
-def _turned(calibration: DepthCalibration) -> list[Finding]:
+def _turned(calibration: DepthCalibration, pixel: float) -> list[Finding]:  # degrees of a pixel
     """Return a line if depth is turned against the events by more than their noise could feign."""
     angle = float(np.degrees(np.linalg.norm(calibration.rotation)))
-    is_needed = calibration.before > CONTRADICTION or calibration.after < RESOLVED * calibration.before
-    if angle < SMALLEST_TURN or not is_needed:
+    is_needed = calibration.after < TURNED * calibration.before
+    if angle < max(SMALLEST_TURN, pixel) or not is_needed:
         return []
     return [
         Finding(
