@@ -24,7 +24,7 @@ class TimeSurfaceConfig(Stage):
 
     decay: float = Field(0.03, gt=0)
     """tau in Eq. 1 (the text also calls it eta), seconds. Not given in the paper; ESVO uses 0.03."""
-    blur: float = Field(1.0, ge=0)
+    blur: float = Field(1.0, ge=0, le=100)
     """Standard deviation in pixels of the Gaussian that smooths the surface before alignment."""
 
 
