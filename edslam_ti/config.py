@@ -300,8 +300,8 @@ class Config(Stage):
     scene: str = Field("office0", min_length=1)
     """Sequence: a folder name under the data folder, or a built-in room."""
     dataset: str | None = None
-    """Input format: generic, event_replica, rpg, vector, dsec, tum_vie, mvsec, m3ed, evslam, rgbd, builtin; omitted:
-    detected from the files in the data folder, else the built-in room."""
+    """Input format: generic, event_replica, rpg, vector, dsec, tum_vie, mvsec, m3ed, evslam, rgbd, builtin;
+    omitted: detected from the files in the data folder, else the built-in room."""
     data_dir: Path = Path("data")
     """Folder that holds the sequences."""
     calibrate: Literal["none", "depth"] = "none"
