@@ -5,6 +5,7 @@ from edslam_ti.cold_start import load_kernels
 load_kernels()  # as commands do, before anything below loads numpy or torch
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,11 @@ from edslam_ti.datasets.event_replica import EventReplicaSequence
 
 # Real recordings, kept beside the project and never in it
 DATA = Path(os.environ.get("EDSLAM_DATA") or Path(__file__).parents[2] / "shared" / "data")
+
+
+# A shell ignores Ctrl-C for what it starts in the background; tests of signals need what a terminal gives.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
