@@ -80,7 +80,14 @@ ORDERS: dict[str, list[str]] = {
     "mapping": [
         *("gaussian_ply", "gaussians", "rendering", "losses", "volume", "mapper", "budget", "insertion"),
         *("keyframes", "densification", "recolouring", "targets", "poses", "shown_map", "gaussian_mapper"),
-        *("change_loss", "brightness_solve", "change_mapper", "paper_mapper", "event_only_mapper"),
+        *(
+            "change_loss",
+            "brightness_solve",
+            "depth_solve",
+            "change_mapper",
+            "paper_mapper",
+            "event_only_mapper",
+        ),
     ],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [

@@ -78,6 +78,9 @@ class IncEventMapper(EventOnlyMapper):
         if self._settings.solve_views and self._num_frames % self._settings.solve_every == 0:
             self.solve_brightness(trajectory, recent)
 
+    def _begin_final(self, trajectory: Trajectory) -> None:
+        self.solve_brightness(trajectory, self._sums.frames)  # depth is known by now
+
     def _poses_are_free(self, done: float) -> bool:
         return self._adjusts_poses
 
@@ -127,19 +130,7 @@ class IncEventMapper(EventOnlyMapper):
         self._rotate(rotation, frames, trajectory)
         self.gaussians.set_colors(torch.full((len(self.gaussians), 1), self._config.background))
         self.solve_brightness(trajectory, frames)
-        reduction = Reduction.of(self._camera, self._coarsest)
-        knots = [self._sums.knots(k)[-1] for k in frames if self._sums.knots(k)]
-        logs = [
-            reduction.reduced((self._view(trajectory.at(k.time)).intensity + self._config.log_epsilon).log())
-            for k in knots
-        ]
-        wrong, all_ = 0.0, 0.0
-        for gap in (1, len(knots) - 1):
-            for a in range(len(knots) - gap):
-                change = reduction.reduced(self._sums.change(knots[a], knots[a + gap]))
-                wrong += float((logs[a + gap] - logs[a] - change).square().mean())
-                all_ += float(change.square().mean())
-        return wrong / max(all_, 1e-12)
+        return self.unexplained(trajectory, frames)
 
     def _rotate(self, rotation: np.ndarray, frames: list[int], trajectory: Trajectory) -> None:
         """Set the frames' poses to a constant rotation about x and y from the first one's."""

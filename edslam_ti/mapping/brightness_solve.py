@@ -48,10 +48,16 @@ def solve_brightness(
     seen = [view.dominant[::STRIDE, ::STRIDE].reshape(-1).long() for view in views]
     logs = [(view.intensity[::STRIDE, ::STRIDE].reshape(-1) + epsilon).log() for view in views]
     rows = [_rows(pair, seen, logs) for pair in pairs]
-    first, second, residual = (torch.cat(parts) for parts in zip(*rows)) if rows else ((torch.zeros(0),) * 3)
+    if not rows:
+        return False
+    first, second, residual = (torch.cat(parts) for parts in zip(*rows))
     if len(residual) == 0:
         return False
-    correction, is_seen = _conjugate_gradients(first, second, residual, len(gaussians), iterations)
+    weight = (HUBER / residual.abs().clamp_min(1e-6)).clamp_max(1.0)
+    factors = -torch.ones_like(residual), torch.ones_like(residual)
+    correction, is_seen = conjugate_gradients(
+        first, second, factors, weight, residual, len(gaussians), HOLD, iterations
+    )
     correction = _spread(gaussians.raw["means"].detach(), correction, is_seen)
     shown = [log[k >= 0] + correction[k[k >= 0]] for log, k in zip(logs, seen)]
     white = torch.cat(shown).sort().values
@@ -69,25 +75,30 @@ def _rows(pair: Pair, seen: list[Tensor], logs: list[Tensor]) -> tuple[Tensor, T
     return a[used], b[used], residual[used]
 
 
-def _conjugate_gradients(
-    first: Tensor,  # [R] Gaussian at the start
-    second: Tensor,  # [R] at the end
+def conjugate_gradients(
+    first: Tensor,  # [R] unknown
+    second: Tensor,  # [R] unknown
+    factors: tuple[Tensor, Tensor],  # [R] each, of the two
+    weight: Tensor,  # [R]
     residual: Tensor,  # [R]
     count: int,
+    hold: float,
     iterations: int,
-) -> tuple[Tensor, Tensor]:  # [N] correction, [N] bool: some row holds it
-    """Minimise sum w (x[second] - x[first] - residual)^2 + HOLD |x|^2."""
-    weight = (HUBER / residual.abs().clamp_min(1e-6)).clamp_max(1.0)
+) -> tuple[Tensor, Tensor]:  # [N] unknowns, [N] bool: some row holds it
+    """Minimise sum w (f_2 x[second] + f_1 x[first] - residual)^2 + hold |x|^2."""
+    of_first, of_second = factors
 
-    def gathered(value: Tensor) -> Tensor:  # [R] -> [N]: the transpose of taking differences
+    def gathered(value: Tensor) -> Tensor:  # [R] -> [N]: the transpose of the rows
         zero = torch.zeros(count, dtype=value.dtype, device=value.device)
-        return zero.index_add_(0, second, value).index_add_(0, first, -value)
+        return zero.index_add_(0, second, of_second * value).index_add_(0, first, of_first * value)
 
     def applied(x: Tensor) -> Tensor:
-        return gathered(weight * (x.index_select(0, second) - x.index_select(0, first))) + HOLD * x
+        rows = of_second * x.index_select(0, second) + of_first * x.index_select(0, first)
+        return gathered(weight * rows) + hold * x
 
-    diagonal = torch.full((count,), HOLD, device=residual.device)
-    diagonal = diagonal.index_add_(0, second, weight).index_add_(0, first, weight)
+    diagonal = torch.full((count,), hold, device=residual.device)
+    diagonal = diagonal.index_add_(0, second, weight * of_second**2)
+    diagonal = diagonal.index_add_(0, first, weight * of_first**2)
     x = torch.zeros_like(diagonal)
     r = gathered(weight * residual)
     z = r / diagonal
@@ -99,7 +110,7 @@ def _conjugate_gradients(
         z = r / diagonal
         last, rz = rz, r @ z
         p = z + rz / last.clamp_min(1e-30) * p
-    return x, diagonal > 2 * HOLD
+    return x, diagonal > 2 * hold
 
 
 def _spread(means: Tensor, correction: Tensor, is_seen: Tensor) -> Tensor:  # [N, 3], [N], [N] -> [N]

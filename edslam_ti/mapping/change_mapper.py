@@ -12,14 +12,16 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.sums import EventSums, Knot
+from edslam_ti.geometry import inverse
 from edslam_ti.mapping.brightness_solve import Pair, solve_brightness
 from edslam_ti.mapping.budget import Budget, prune_faded
 from edslam_ti.mapping.change_loss import PathPoses, Reduction, change_loss
+from edslam_ti.mapping.depth_solve import SeenFrom, solve_depth
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
 from edslam_ti.mapping.losses import scale_loss
 from edslam_ti.mapping.mapper import Progress
 from edslam_ti.mapping.poses import PoseRefiner
-from edslam_ti.mapping.rendering import drawable
+from edslam_ti.mapping.rendering import drawable, render_map
 from edslam_ti.mapping.shown_map import ShownMap
 from edslam_ti.mapping.targets import FrameSampler, evenly
 from edslam_ti.trajectory import Trajectory
@@ -28,7 +30,8 @@ ONLINE_SHARE = 0.5  # share of the budget for the steps during the run
 ADJUST_FROM = 0.3  # fraction of the final steps after which poses are optimised, too
 LAST_RATE = 0.05  # learning rates fall to this share of their values during the final steps
 WHITE_LEVEL = 0.93  # brightness given to the brightest percent of pixels
-PAIR_STEPS = (1, 2, 4, 8, 16)  # the solve compares views this many apart
+PAIR_STEPS = (1, 2, 4, 8, 16)  # the solve for brightness compares views this many apart
+NEAR_STEPS = (1, 2, 4, 8)  # that for depth, too: images further apart hardly overlap
 FEWEST_EVENTS = 0.3  # of the wanted number; at the start of the events there may be no more
 MIN_VIEWS = 3  # needed before brightness can be solved for
 
@@ -198,16 +201,47 @@ class ChangeMapper(ShownMap):
 
     def solve_brightness(self, trajectory: Trajectory, frames: Sequence[int]) -> None:
         """Correct all brightness at once (brightness_solve.py), from views spread over some frames."""
-        knots = [self._sums.knots(k)[-1] for k in frames if self._sums.knots(k)]
-        chosen = [knots[k] for k in evenly(list(range(len(knots))), self._settings.solve_views)]
-        if len(chosen) < MIN_VIEWS:
+        knots = self._spread_knots(frames)
+        if len(knots) < MIN_VIEWS:
             return
-        views = [self._view(trajectory.at(knot.time)) for knot in chosen]
-        pairs = [
-            Pair(k, k + gap, self._sums.change(chosen[k], chosen[k + gap]))
-            for gap in PAIR_STEPS
-            for k in range(len(chosen) - gap)
-            if chosen[k + gap].time - chosen[k].time <= self._config.stretch
+        views = [self._view(trajectory.at(knot.time)) for knot in knots]
+        epsilon, iterations = self._config.log_epsilon, self._settings.solve_iterations
+        solve_brightness(
+            self.gaussians, views, self._pairs(knots, PAIR_STEPS), epsilon, WHITE_LEVEL, iterations
+        )
+
+    def solve_depth(self, trajectory: Trajectory, frames: Sequence[int], level: int, cell: float) -> None:
+        """Move all Gaussians along their rays at once (depth_solve.py), on images reduced by 2^level.
+
+        Those of a cell, `cell` radians wide, move together.
+        """
+        knots = self._spread_knots(frames)
+        if len(knots) < MIN_VIEWS:
+            return
+        reduction = Reduction.of(self._camera, level)
+        poses = [trajectory.at(knot.time) for knot in knots]
+        seen = [
+            SeenFrom(
+                render_map(self.gaussians, reduction.camera, T, self._config.background),
+                torch.from_numpy(inverse(T)).float(),
+            )
+            for T in poses
         ]
         epsilon, iterations = self._config.log_epsilon, self._settings.solve_iterations
-        solve_brightness(self.gaussians, views, pairs, epsilon, WHITE_LEVEL, iterations)
+        solve_depth(
+            self.gaussians, seen, self._pairs(knots, NEAR_STEPS), reduction, epsilon, cell, iterations
+        )
+
+    def _spread_knots(self, frames: Sequence[int]) -> list[Knot]:
+        """Return the last knots of at most `solve_views` frames, evenly spread."""
+        knots = [self._sums.knots(k)[-1] for k in frames if self._sums.knots(k)]
+        return [knots[k] for k in evenly(list(range(len(knots))), self._settings.solve_views)]
+
+    def _pairs(self, knots: Sequence[Knot], gaps: Sequence[int]) -> list[Pair]:
+        """Return the changes between knots that are some knots, and not too much time, apart."""
+        return [
+            Pair(k, k + gap, self._sums.change(knots[k], knots[k + gap]))
+            for gap in gaps
+            for k in range(len(knots) - gap)
+            if knots[k + gap].time - knots[k].time <= self._config.stretch
+        ]

@@ -6,6 +6,7 @@ renders (Eq. 10 to 12) moves them to where the changes agree, coarse to fine.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,11 +16,17 @@ from edslam_ti.config import Config
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.frame import Frame
 from edslam_ti.mapping.budget import prune_faded, stride_for_budget
+from edslam_ti.mapping.change_loss import Reduction
 from edslam_ti.mapping.change_mapper import ChangeMapper
 from edslam_ti.mapping.insertion import spaced
 from edslam_ti.trajectory import Trajectory
 
 COARSEST = 96  # pixels, about: images are halved until they are as wide, and the steps begin there
+# Radians; depth is found in cells of these sizes, one after the other, seen from the middle of the path.
+CELLS = (*(0.3, 0.3, 0.2, 0.2, 0.15, 0.15), *(0.1, 0.1, 0.1, 0.06, 0.06, 0.06, 0.06))
+DEPTH_AGAIN = 0.03
+COARSE_CELL = 0.15  # from this size on the coarsest images are used, for smaller ones images twice as large
+DISTANCES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)  # of the first guess, tried for all Gaussians together
 FINEST_SHARE = 0.2  # of the final steps are taken on full images
 
 
@@ -84,10 +91,56 @@ class EventOnlyMapper(ChangeMapper):
             if window is not None:
                 self.step(*window, trajectory, free=None, level=self._coarsest)
 
+    def _begin_final(self, trajectory: Trajectory) -> None:
+        """Find the distance of everything, then depth in ever smaller cells, in turn with brightness."""
+        if not self._settings.solve_views:
+            return
+        frames = self._sums.frames
+        self._try_distances(trajectory)
+        for cell in CELLS:
+            self.solve_brightness(trajectory, frames)
+            level = self._coarsest if cell >= COARSE_CELL else self._coarsest - 1
+            self.solve_depth(trajectory, frames, max(level, 0), cell)
+
+    def _try_distances(self, trajectory: Trajectory) -> None:
+        """Move all Gaussians away from the middle of the path, or nearer, as events say."""
+        frames, middle = self._sums.frames, torch.from_numpy(trajectory.poses[:, :3, 3].mean(0)).float()
+        raw, everyone = self.gaussians.raw, torch.arange(len(self.gaussians))
+        away, log_scales = raw["means"].detach() - middle, raw["log_scales"].detach().clone()
+
+        def place(factor: float) -> None:
+            self.gaussians.overwrite("means", everyone, middle + factor * away)
+            self.gaussians.overwrite("log_scales", everyone, log_scales + math.log(factor))
+
+        errors = []
+        for factor in DISTANCES:
+            place(factor)
+            self.solve_brightness(trajectory, frames)
+            errors.append(self.unexplained(trajectory, frames))
+        place(DISTANCES[int(np.argmin(errors))])
+
+    def unexplained(self, trajectory: Trajectory, frames: Sequence[int]) -> float:
+        """Return the share of the change between some frames that the map leaves unexplained."""
+        reduction, knots = Reduction.of(self._camera, self._coarsest), self._spread_knots(frames)
+        logs = [
+            reduction.reduced((self._view(trajectory.at(k.time)).intensity + self._config.log_epsilon).log())
+            for k in knots
+        ]
+        wrong, total = 0.0, 0.0
+        for pair in self._pairs(knots, (1, max(len(knots) // 2, 1))):
+            change = reduction.reduced(pair.change)
+            wrong += float((logs[pair.end] - logs[pair.start] - change).square().mean())
+            total += float(change.square().mean())
+        return wrong / max(total, 1e-12)
+
     def _final_step(self, number: int, trajectory: Trajectory, free: range | None) -> None:
+        level = self._level(number / self._config.final_iterations)
         if self._settings.solve_views and number % self._event_only.solve_steps == 0:
             prune_faded(self.gaussians, self._event_only.min_opacity)
             self.solve_brightness(trajectory, self._sums.frames)
+            if DEPTH_AGAIN and number:
+                self.solve_depth(trajectory, self._sums.frames, max(level-1,0), DEPTH_AGAIN)
+                self.solve_brightness(trajectory, self._sums.frames)
         window = self.window(self._sampler.any(self._sums.frames))
         if window is not None:
-            self.step(*window, trajectory, free, self._level(number / self._config.final_iterations))
+            self.step(*window, trajectory, free, level)
