@@ -139,7 +139,7 @@ class EventOnlyMapper(ChangeMapper):
             prune_faded(self.gaussians, self._event_only.min_opacity)
             self.solve_brightness(trajectory, self._sums.frames)
             if DEPTH_AGAIN and number:
-                self.solve_depth(trajectory, self._sums.frames, max(level-1,0), DEPTH_AGAIN)
+                self.solve_depth(trajectory, self._sums.frames, max(level - 1, 0), DEPTH_AGAIN)
                 self.solve_brightness(trajectory, self._sums.frames)
         window = self.window(self._sampler.any(self._sums.frames))
         if window is not None:
