@@ -175,8 +175,8 @@ METHODS: dict[str, Method] = {
             "change": {"min_window": 1.0, "max_window": 60.0},
             "event_only": {"nearest": 2.5, "farthest": 2.5},  # one distance, corrected by what events say
             "mapping": {
-                **{"initial_size": 0.8, "initial_opacity": 0.9, "background": 0.4, "means_rate": 0.005},
-                **{"iterations": 0, "final_iterations": 1500, "max_gaussians": 100_000},
+                **{"initial_size": 0.8, "initial_opacity": 0.6, "background": 0.4, "means_rate": 0.005},
+                **{"iterations": 0, "final_iterations": 2400, "max_gaussians": 100_000},
             },
         },
     ),

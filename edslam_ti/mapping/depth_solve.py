@@ -1,14 +1,15 @@
 """The depth of all Gaussians at once, from the event loss between many pairs of renders.
 
-Gradient steps move a Gaussian by millimetres, whatever its depth lacks. For fixed brightness the loss is
-nearly linear in small motions along the rays: a pixel shows one Gaussian above all, and where that moves by
-the share delta of its distance from the middle of the path, the log brightness L there changes by -grad L .
-j delta, with j the motion of its image. A pair of views a, b says
+Gradient steps move a Gaussian by millimetres, however far it is from the surface. For fixed brightness the
+loss is nearly linear in small motions along the rays. A pixel shows one Gaussian above all. Where that
+moves by the share delta of its distance from the middle of the path, the log brightness L changes by -grad
+L . j delta, with j the motion of its image. A pair of views a, b says
 
     -(grad L_b . j_b) delta[seen at b] + (grad L_a . j_a) delta[seen at a] = measured - rendered change
 
 (Eq. 10 to 12, one row per pixel). Conjugate gradients solve it; the result is a Gauss-Newton step of the
-event loss. Images are reduced, so that motions of some pixels are small.
+loss. Gaussians of a cell, as seen from the middle of the path, move together: a surface is smooth, and its
+events are at its edges. Images are reduced, so that motions of some pixels are small.
 """
 
 from collections.abc import Sequence

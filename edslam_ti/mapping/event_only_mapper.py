@@ -24,10 +24,10 @@ from edslam_ti.trajectory import Trajectory
 COARSEST = 96  # pixels, about: images are halved until they are as wide, and the steps begin there
 # Radians; depth is found in cells of these sizes, one after the other, seen from the middle of the path.
 CELLS = (*(0.3, 0.3, 0.2, 0.2, 0.15, 0.15), *(0.1, 0.1, 0.1, 0.06, 0.06, 0.06, 0.06))
-DEPTH_AGAIN = 0.03
+LAST_CELL = 0.03  # radians, of cells that are moved between the final steps
 COARSE_CELL = 0.15  # from this size on the coarsest images are used, for smaller ones images twice as large
 DISTANCES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)  # of the first guess, tried for all Gaussians together
-FINEST_SHARE = 0.2  # of the final steps are taken on full images
+FINEST_SHARE = 0.4  # of the final steps are taken on full images
 
 
 class EventOnlyMapper(ChangeMapper):
@@ -36,6 +36,7 @@ class EventOnlyMapper(ChangeMapper):
     def __init__(self, camera: Camera, contrast: ContrastThreshold, config: Config) -> None:
         super().__init__(camera, contrast, config)
         self._event_only = config.event_only
+        self._moves_depth = True
         self._coarsest = max(0, round(math.log2(camera.width / COARSEST)))
 
     def update(self, frame: Frame, trajectory: Trajectory) -> None:
@@ -137,10 +138,9 @@ class EventOnlyMapper(ChangeMapper):
         level = self._level(number / self._config.final_iterations)
         if self._settings.solve_views and number % self._event_only.solve_steps == 0:
             prune_faded(self.gaussians, self._event_only.min_opacity)
+            if number and self._moves_depth:
+                self.solve_depth(trajectory, self._sums.frames, max(level - 1, 0), LAST_CELL)
             self.solve_brightness(trajectory, self._sums.frames)
-            if DEPTH_AGAIN and number:
-                self.solve_depth(trajectory, self._sums.frames, max(level - 1, 0), DEPTH_AGAIN)
-                self.solve_brightness(trajectory, self._sums.frames)
         window = self.window(self._sampler.any(self._sums.frames))
         if window is not None:
             self.step(*window, trajectory, free, level)
