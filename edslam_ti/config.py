@@ -244,17 +244,16 @@ class IncEventGsConfig(Stage):
 
     bootstrap_frames: int = Field(6, ge=3)
     """Chunks over which map and poses are found together (authors: 3 in the paper, 5 in their code)."""
-    bootstrap_steps: int = Field(400, ge=1)
-    """Steps of the bootstrap (authors: 3501)."""
-    tracking_steps: int = Field(40, ge=1)
-    """Adam steps for each chunk's pose (authors: 201)."""
-    tracking_rate: float = Field(2e-3, gt=0)
-    """Their learning rate, metres and radians (authors: 1e-4)."""
-    adjust_every: int = Field(2, ge=1)
+    bootstrap_steps: int = Field(100, ge=0)
+    """Gradient steps at the end of the bootstrap (authors: 3501 without Gauss-Newton steps)."""
+    tracking_steps: int = Field(6, ge=1)
+    """At most this many Gauss-Newton steps for a pose, on each of two sizes of images (authors: 201 of
+    Adam)."""
+    adjust_every: int = Field(1, ge=1)
     """Chunks between two sliding bundle adjustments (authors: 2)."""
-    window: int = Field(20, ge=2)
+    window: int = Field(10, ge=2)
     """Chunks that a sliding bundle adjustment covers (authors: 20)."""
-    min_explained: float = Field(0.4, gt=0, lt=1)
+    min_explained: float = Field(0.3, gt=0, lt=1)
     """With a smaller share of the change explained by the map, tracking has failed."""
 
 

@@ -160,9 +160,11 @@ METHODS: dict[str, Method] = {
         "IncEventGS: poses and map from events alone, by the change between two renders; no scale",
         _inc_event_gs,
         {
+            "change": {"min_window": 0.5, "max_window": 6.0, "solve_views": 8},
+            "event_only": {"nearest": 2.0, "farthest": 3.0},  # only the ratio matters: the scale is unknown
             "mapping": {
-                **{"initial_size": 0.8, "initial_opacity": 0.5, "background": 0.4, "means_rate": 0.005},
-                **{"iterations": 15, "final_iterations": 1000, "max_gaussians": 100_000},
+                **{"initial_size": 0.8, "initial_opacity": 0.6, "background": 0.4, "means_rate": 0.005},
+                **{"iterations": 5, "final_iterations": 800, "max_gaussians": 100_000},
                 **{"poses_rate": 2e-4},
             },
         },

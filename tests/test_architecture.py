@@ -84,6 +84,7 @@ ORDERS: dict[str, list[str]] = {
             "change_loss",
             "brightness_solve",
             "depth_solve",
+            "pose_solve",
             "change_mapper",
             "paper_mapper",
             "event_only_mapper",

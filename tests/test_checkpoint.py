@@ -21,6 +21,7 @@ from edslam_ti.command_line import UsageError, parse_config, read_choices
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample
 from edslam_ti.errors import DataError
+from edslam_ti.mapping.change_mapper import ChangeMapper
 from edslam_ti.mapping.gaussian_mapper import GaussianMapper
 from edslam_ti.object_graph import Graph
 from edslam_ti.pipeline import resume, run
@@ -154,6 +155,32 @@ def test_other_methods_and_settings_are_resumed_as_well(
     is_mapping = config.mapping.enabled
     folder = cut_off(config, monkeypatch, *((99, 8) if is_mapping else (9, None)))
     resume(folder, config, quiet())
+    assert same_files(folder, whole)
+
+
+@pytest.mark.parametrize(
+    ("method", "frame"),  # 99: in mid refinement
+    [("ed_slam_paper", 99), ("event_3dgs", 99), ("inc_event_gs", 7), ("depth_event_vo", 4)],
+)
+def test_methods_of_other_papers_are_resumed_as_well(
+    method: str, frame: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(config_for(tiny_folder, tmp_path / "whole", method, duration=0.45), quiet())
+    config = config_for(tiny_folder, tmp_path / "cut", method, duration=0.45)
+    step = ChangeMapper.step
+
+    def stepped(self: ChangeMapper, *arguments: Any, **options: Any) -> float:
+        if self._num_final == 8:
+            raise Cut
+        return step(self, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        if frame == 99:
+            patch.setattr(ChangeMapper, "step", stepped)
+        folder = cut_off(config, monkeypatch, frame)
+    console = quiet()
+    resume(folder, config, console)
+    assert "resumed from the first frame" not in console.file.getvalue()  # type: ignore[attr-defined]
     assert same_files(folder, whole)
 
 

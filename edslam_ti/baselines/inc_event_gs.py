@@ -1,8 +1,8 @@
 """IncEventGS (Huang et al. 2025): a map and poses from events alone, re-implemented from the paper.
 
-Bootstrap    Gaussians at random depth, and poses, are optimised together over the first chunks.
+Bootstrap    Gaussians at random depth, their brightness, and poses are found in turn over the first chunks.
 Tracking     the pose at the end of each new chunk is that with which the map explains the chunk's events best
-             (Eq. 10 to 12 of ED-SLAM's paper, which are theirs), by Adam on a twist; Eq. 9 in between.
+             (Eq. 10 to 12 of ED-SLAM's paper, which are theirs), by Gauss-Newton steps.
 Mapping      Gaussians are added where nothing is drawn; sliding bundle adjustment over the last chunks, and a
              global one at the end.
 
@@ -20,16 +20,17 @@ from edslam_ti.camera import Camera
 from edslam_ti.config import Config, IncEventGsConfig
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.frame import Frame
-from edslam_ti.geometry import interpolate, orthonormalized, se3_exp
-from edslam_ti.mapping.change_loss import Reduction, change_loss
+from edslam_ti.geometry import se3_exp
+from edslam_ti.mapping.change_loss import Reduction
 from edslam_ti.mapping.event_only_mapper import EventOnlyMapper
-from edslam_ti.mapping.rendering import drawable
+from edslam_ti.mapping.pose_solve import SolvedPose, solve_pose
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
 
-LAST_RATE = 0.1  # the tracker's learning rate falls to this share
 BOOTSTRAP_RATE = 1e-3  # metres and radians a step: of poses that are not known at all
-START_FLOW = 3.0  # px of the coarsest images in a frame; the first guess of a motion is a multiple of it
+START_FLOW = 1.5  # px of the coarsest images in a frame; motions of a few times this are tried first
+CELLS = (*(0.3, 0.3, 0.3, 0.3, 0.2, 0.2, 0.2, 0.2), *(0.15, 0.15, 0.15, 0.15))  # radians; see depth_solve.py
+LAST_CELL = 0.1  # radians, of cells that sliding bundle adjustment moves
 SOLVE_IN_BOOTSTRAP = 40  # steps between two solves of brightness
 
 
@@ -71,12 +72,15 @@ class IncEventMapper(EventOnlyMapper):
         first = len(trajectory) - self._inc.window
         free = None if self._is_given_poses else range(max(first, 1), len(trajectory))
         recent = [k for k in self._sums.frames if k >= first]
+        self.solve_brightness(trajectory, recent)
+        self.solve_depth(trajectory, recent, self._coarsest, LAST_CELL)
+        if not self._is_given_poses:
+            self._align(recent, trajectory)
+            self.solve_brightness(trajectory, recent)
         for _ in range(self._config.iterations * self._inc.adjust_every):
             window = self.window(recent[int(self._random.integers(len(recent)))])
             if window is not None:
                 self.step(*window, trajectory, free, self._coarsest)
-        if self._settings.solve_views and self._num_frames % self._settings.solve_every == 0:
-            self.solve_brightness(trajectory, recent)
 
     def _begin_final(self, trajectory: Trajectory) -> None:
         self.solve_brightness(trajectory, self._sums.frames)  # depth is known by now
@@ -93,20 +97,47 @@ class IncEventMapper(EventOnlyMapper):
         self.gaussians.keep(everyone)  # of an attempt before, which failed
         self._fill(trajectory.pose(frames[0]), frames[0])
         self._guess_motion(frames, trajectory)
-        free = range(frames[0] + 1, frames[-1] + 1)
-        rate, unexplained = self._refiner.rate, 1.0
+        for cell in CELLS:
+            self.solve_brightness(trajectory, frames)
+            self.explained = self._align(frames, trajectory)
+            self.solve_depth(trajectory, frames, self._coarsest, cell)
+            self._fill(trajectory.pose(frames[-1]), frames[-1])
+        self._refine(frames, trajectory)
+        self.has_map = self.explained >= self._inc.min_explained
+
+    def _align(self, frames: list[int], trajectory: Trajectory) -> float:
+        """Align every frame but the first to the map; return the mean share of the change explained."""
+        first = self._sums.knots(frames[0])[-1]
+        image = (self._view(trajectory.at(first.time)).intensity + self._config.log_epsilon).log()
+        shares = []
+        for k in frames[1:]:
+            knots = self._sums.knots(k)
+            if len(knots) == self._settings.knots_per_frame:  # the last one is at the frame: not held out
+                change = self._sums.change(first, knots[-1])
+                solved = self.solve_pose(trajectory.pose(k), image + change, change)
+                trajectory.replace(k, solved.T_world_camera)
+                shares.append(solved.explained)
+        return float(np.mean(shares)) if shares else 0.0
+
+    def _refine(self, frames: list[int], trajectory: Trajectory) -> None:
+        """Take steps on map and poses together."""
+        rate, self._refiner.rate = self._refiner.rate, BOOTSTRAP_RATE
         for k in range(self._inc.bootstrap_steps):
             done = k / self._inc.bootstrap_steps
-            self._refiner.rate = BOOTSTRAP_RATE * (1 - 0.9 * done)
             if k % SOLVE_IN_BOOTSTRAP == 0:
                 self.solve_brightness(trajectory, frames)
             window = self.window(frames[1 + int(self._random.integers(len(frames) - 1))])
             if window is not None and window[0].time >= trajectory.timestamp(frames[0]):
-                error = self.step(*window, trajectory, free, self._level(done))
-                unexplained = 0.9 * unexplained + 0.1 * error
+                self.step(*window, trajectory, range(frames[0] + 1, frames[-1] + 1), self._level(done))
         self._refiner.rate = rate
-        self.explained = 1 - unexplained
-        self.has_map = self.explained >= self._inc.min_explained
+
+    def solve_pose(self, start: np.ndarray, image: Tensor, change: Tensor) -> SolvedPose:
+        """Return the pose at which the map looks like an image [H, W], of which `change` is measured."""
+        levels = tuple(Reduction.of(self._camera, k) for k in (self._coarsest, max(self._coarsest - 1, 0)))
+        background, epsilon = self._config.background, self._config.log_epsilon
+        return solve_pose(
+            self.gaussians, start, image, change, levels, background, epsilon, self._inc.tracking_steps
+        )
 
     def _guess_motion(self, frames: list[int], trajectory: Trajectory) -> None:
         """Start from the constant rotation whose best brightness explains most, of a grid of them.
@@ -140,40 +171,14 @@ class IncEventMapper(EventOnlyMapper):
 
     # --- for the tracker ---
 
-    def explain(
-        self, index: int, end: float, T_newest: Tensor, trajectory: Trajectory, level: int
-    ) -> tuple[Tensor, float] | None:
-        """Return Eq. 12 of a random window that ends in the newest chunk, and the share that it leaves.
-
-        Differentiable in `T_newest` [4, 4], the pose at `end` (seconds); the map stays as it is.
-        """
-        window = self.window(index)
-        if window is None:
-            return None
-        start, T_last = trajectory.timestamp(-1), torch.from_numpy(trajectory.pose(-1))
-        poses = []
-        for knot in window:
-            if knot.time <= start:
-                poses.append(torch.from_numpy(trajectory.at(knot.time)))
-            else:
-                poses.append(interpolate(T_last, T_newest, (knot.time - start) / (end - start)))
-        T, reduction = torch.stack(poses), Reduction.of(self._camera, level)
-        chosen = torch.cat([drawable(self.gaussians, reduction.camera, pose) for pose in T]).unique()
-        if len(chosen) == 0:
-            return None
-        change = self._sums.change(*window)
-        with torch.no_grad():
-            active = self.gaussians.activated(chosen)
-        comparison = change_loss(
-            active, T, change, reduction, self._config.background, self._config.log_epsilon
-        )
-        energy = float(reduction.reduced(change).square().mean())
-        return comparison.loss.sqrt(), float(comparison.loss.detach()) / max(energy, 1e-12)
-
-    @property
-    def coarsest(self) -> int:
-        """The level at which alignment begins."""
-        return self._coarsest
+    def track(self, guess: np.ndarray, trajectory: Trajectory) -> SolvedPose:
+        """Return the pose at the newest knot, whose events the mapper has received."""
+        knots = [knot for k in self._sums.frames[-3:] for knot in self._sums.knots(k)]
+        earlier = [knot for knot in knots if knot.time <= trajectory.timestamp(-1)]
+        start = earlier[-1] if earlier else knots[0]
+        image = (self._view(trajectory.at(start.time)).intensity + self._config.log_epsilon).log()
+        change = self._sums.change(start, knots[-1])
+        return self.solve_pose(guess, image + change, change)
 
 
 class IncEventTracker:
@@ -195,34 +200,11 @@ class IncEventTracker:
                 return TrackingResult(last, True, 0.0)
             explained = self._mapper.explained
             return TrackingResult(last, False, 0.0, f"no map yet: it explains {explained:.0%} of the events")
-        pose, unexplained = self._aligned(index, frame.timestamp, guess, trajectory)
-        quality = max(0.0, 1 - unexplained)
+        solved = self._mapper.track(guess, trajectory)
+        quality = min(max(0.0, solved.explained), 1.0)
         if quality < self._config.min_explained:
             return TrackingResult(guess, False, quality, f"the map explains only {quality:.0%} of the events")
-        return TrackingResult(pose, True, quality)
+        return TrackingResult(solved.T_world_camera, True, quality)
 
     def consistency(self, trajectory: Trajectory) -> None:
         """Return None: there is no depth to compare."""
-
-    def _aligned(
-        self, index: int, end: float, guess: np.ndarray, trajectory: Trajectory
-    ) -> tuple[np.ndarray, float]:
-        """Return the pose after all steps, and the running mean of the share of events not explained."""
-        total = self._config.tracking_steps
-        T_guess = torch.from_numpy(guess)
-        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        adam = torch.optim.Adam([twist], lr=self._config.tracking_rate)
-        unexplained = 1.0
-        for k in range(total):
-            adam.param_groups[0]["lr"] = self._config.tracking_rate * LAST_RATE ** (k / total)
-            level = self._mapper.coarsest if k < total // 2 else max(self._mapper.coarsest - 1, 0)
-            found = self._mapper.explain(index, end, T_guess @ se3_exp(twist), trajectory, level)
-            if found is None:
-                continue
-            loss, share = found
-            adam.zero_grad()
-            loss.backward()
-            adam.step()
-            unexplained = share if unexplained == 1.0 else 0.8 * unexplained + 0.2 * share
-        pose = (T_guess @ se3_exp(twist.detach())).numpy()
-        return orthonormalized(pose), unexplained
