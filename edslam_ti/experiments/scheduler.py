@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import TimeElapsedColumn
 
 from edslam_ti.errors import ConfigError, MissingExtraError, plain
-from edslam_ti.experiments.jobs import RESULT, Job, Outcome, job_of, kept, outcome_of, start
+from edslam_ti.experiments.jobs import RESULT, Job, Outcome, job_of, kept, outcome_of, source_commit, start
 from edslam_ti.output import atomic_file
 from edslam_ti.patient_console import progress_bar
 
@@ -38,7 +38,7 @@ def run_jobs(
     """
     jobs = list(dict.fromkeys(jobs))
     todo: list[Work] = []
-    done = 0
+    done, others = 0, 0
     for job in jobs:
         folder = out / "runs" / job.name
         if fresh:
@@ -48,7 +48,13 @@ def run_jobs(
             todo.append((job, folder))
         else:
             done += 1
+            others += outcome.get("commit") != source_commit()
             yield outcome
+    if others:
+        console.print(
+            f"{others} of {done} finished runs are of another version of the program; --fresh repeats all",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
     if not todo:
         return
     with progress_bar(console, TimeElapsedColumn()) as bar:
