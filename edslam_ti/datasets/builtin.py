@@ -1,6 +1,7 @@
 """The built-in sequences: simulated once and kept in the user's cache folder."""
 
 import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,7 @@ GENERATOR_VERSION = 2  # increase it when rooms, paths or rendering change, so t
 
 # Settings added since GENERATOR_VERSION was last increased. Their defaults change nothing, so recordings made
 # before stay valid.
-NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events", "moving_object")
+NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events", "moving_object", "sensor")
 
 
 class BuiltinSequence(EventReplicaSequence):
@@ -41,7 +42,7 @@ def builtin_sequence_folder(
     setting, so changed settings never use old data.
     """
     settings = config or SimulationConfig()
-    key = f"{GENERATOR_VERSION} {settings.model_dump_json(exclude=_unchanged(settings))}"
+    key = f"{GENERATOR_VERSION} {key_of(settings)}"
     version = hashlib.sha256(key.encode()).hexdigest()[:12]
     folder = cached(Path("sequences") / version / scene)
     if (folder / "novel_views").is_dir():  # folders appear whole or not at all
@@ -71,6 +72,9 @@ def builtin_sequence_folder(
     return folder
 
 
-def _unchanged(settings: SimulationConfig) -> set[str]:
+def key_of(settings: SimulationConfig) -> str:
+    """Return a text that differs for every other recording: a preset counts by its values."""
     fields = SimulationConfig.model_fields
-    return {name for name in NEW_SETTINGS if getattr(settings, name) == fields[name].default}
+    unchanged = {name for name in NEW_SETTINGS if getattr(settings, name) == fields[name].default}
+    text = settings.model_dump_json(exclude=unchanged | {"sensor"})
+    return text if "sensor" in unchanged else f"{text} {json.dumps(settings.sensor.facts)}"

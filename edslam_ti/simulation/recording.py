@@ -19,9 +19,11 @@ import numpy as np
 
 from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.errors import DataError
-from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
+from edslam_ti.kernels.event_simulation import EventArrays
 from edslam_ti.output import atomic_folder, check_replaceable, write_npy_header
+from edslam_ti.sensor_config import SensorConfig
 from edslam_ti.simulation.depth_noise import kinect_depth
+from edslam_ti.simulation.event_sensor import make_sensor
 from edslam_ti.simulation.moving import MovingObject, MovingRenderer
 from edslam_ti.simulation.paths import CameraPath
 from edslam_ti.simulation.renderer import Render
@@ -31,6 +33,7 @@ from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_t
 
 MILLISECOND = 1_000_000  # nanoseconds
 TITLE = "Simulated recording"  # how README.txt begins
+UNKNOWN = "unknown"  # C of a sensor with faults, which nobody knows exactly
 FILES = ("README.txt", "camera.json", "poses_ts.txt", "traj.txt", "surfaces.ply")
 PICTURES = ("images", "depth", "novel_views/images", "novel_views/depth")
 
@@ -79,37 +82,25 @@ def simulate(
     with atomic_folder(out, why_not_a_recording) as folder:
         for name in ("images", "depth"):
             (folder / name).mkdir()
-        threshold = folder / f"event_threshold_{config.contrast_threshold:g}"
+        known = f"{config.contrast_threshold:g}" if config.states_threshold else UNKNOWN
+        threshold = folder / f"event_threshold_{known}"
         threshold.mkdir()
         images = _ImageWriter(folder / "images", image_times, config.exposure)
         depths = _DepthWriter(folder / "depth", set(depth_times), config)
         now, num_frames = 0, 1
         render = renderer.render(path.pose(0.0), 0.0)
-        log_now = _log_intensity(render, config)
-        state = EventSensorState.start(log_now)
+        sensor = make_sensor(config, _log_intensity(render, config))
         depths.add(now, render)
         file = threshold / "gray_events_data.npy"
         with EventFileWriter(file, np.float32 if config.compact_events else np.float64) as events:
             while now < end:
                 following = times.after(now, render.depth)
                 render_next = renderer.render(path.pose(following / 1e9), following / 1e9)
-                log_next = _log_intensity(render_next, config)
-                fired = simulate_events(
-                    log_now,
-                    log_next,
-                    now,
-                    following,
-                    state,
-                    config.contrast_threshold,
-                    config.negative_contrast_threshold or config.contrast_threshold,
-                    config.threshold_noise,
-                    round(config.refractory_period * 1e9),
-                    config.seed,
-                )
+                fired = sensor.advance(_log_intensity(render_next, config), following)
                 events.append(_without_gap(fired, config.event_gap))
                 images.add(now, render.grey, following, render_next.grey)
                 depths.add(following, render_next)
-                now, render, log_now = following, render_next, log_next
+                now, render = following, render_next
                 num_frames += 1
                 if progress:
                     progress(now / end)
@@ -348,13 +339,14 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "cx": camera.cx,
         "cy": camera.cy,
         "pixel_centres": "integer",
-        "contrast_threshold": config.contrast_threshold,
+        "contrast_threshold": config.contrast_threshold if config.states_threshold else None,
         "depth_scale": DEPTH_UNITS_PER_METRE,
         "exposure": config.exposure,
         "description": scene.description,
     }
-    (folder / "camera.json").write_text(json.dumps(values, indent=2) + "\n")
-    settings = "\n".join(f"  {key}: {value}" for key, value in config.model_dump().items())
+    stated = {name: value for name, value in values.items() if value is not None}
+    (folder / "camera.json").write_text(json.dumps(stated, indent=2) + "\n")
+    settings = "\n".join(f"  {key}: {value}" for key, value in _shown_settings(config).items())
     (folder / "README.txt").write_text(
         f"{TITLE}: {scene.description}.\n\n"
         "poses_ts.txt, traj.txt: seconds and camera-to-world pose (16 numbers, row-major; x right, y down,\n"
@@ -367,3 +359,12 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "novel_views/: true views near the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
         f"Settings:\n{settings}\n"
     )
+
+
+def _shown_settings(config: SimulationConfig) -> dict[str, Any]:
+    """Return the settings by name, those of the sensor with the preset's values, if there are faults."""
+    values = config.model_dump(exclude={"sensor"})
+    if config.sensor == SensorConfig():
+        return values
+    values["sensor"] = config.sensor.preset
+    return values | {f"sensor.{name}": value for name, value in config.sensor.facts.items()}

@@ -2,10 +2,11 @@
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError, shown
+from edslam_ti.sensor_config import SensorConfig
 
 if TYPE_CHECKING:  # reading options must not load numpy
     from edslam_ti.camera import Camera
@@ -68,7 +69,8 @@ class SimulationConfig(Stage):
     compact_events: bool = False
     """Events as float32: half the disk space; stamps are exact to 0.3 us up to 4 s, 4 us up to a minute."""
     seed: int = Field(0, ge=0, le=2**31 - 1)
-    """Seed of path, threshold noise and depth noise."""
+    """Seed of path, threshold noise, depth noise, and of all that is random in the sensor."""
+    sensor: SensorConfig = SensorConfig()
 
     def __init__(self, **values: Any) -> None:
         """Check the values; the first invalid one raises `ConfigError`."""
@@ -78,6 +80,21 @@ class SimulationConfig(Stage):
             problem = error.errors()[0]
             name = ".".join(str(part) for part in problem["loc"])
             raise ConfigError(f"{name}: {problem['msg']}, got {shown(problem['input'])}") from error
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sized_as_the_sensor(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Take the size of the sensor where none is given."""
+        if "sensor" not in values:
+            return values
+        sensor = SensorConfig.validated(values["sensor"], "sensor")
+        size = sensor.sensor.size
+        return values if size is None else {"width": size[0], "height": size[1], **values}
+
+    @property
+    def states_threshold(self) -> bool:
+        """Whether the recording says what C is: real ones do not."""
+        return self.sensor.sensor.is_ideal and self.sensor.sensor.positive_threshold is None
 
     @property
     def camera(self) -> "Camera":

@@ -1,0 +1,146 @@
+"""Settings of a simulated event sensor and its faults; docs/sensors.md gives the presets' sources."""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import ConfigDict, Field, model_validator
+
+from edslam_ti.stage import Stage
+
+SensorName = Literal["ideal", "typical", "davis346", "dvxplorer", "prophesee_gen4"]
+
+
+@dataclass(frozen=True)
+class EventSensor:
+    """What a simulated event sensor is like; each fault is absent at its default."""
+
+    size: tuple[int, int] | None = None  # width and height in pixels; None: the recording's own
+    positive_threshold: float | None = None  # C+; None: the recording's contrast threshold
+    negative_threshold: float | None = None  # C-; None: the same as C+
+    threshold_spread: float = 0.0  # standard deviation from pixel to pixel, relative
+    threshold_jitter: float = 0.0  # standard deviation from event to event, relative
+    bandwidth: float = 0.0  # Hz at brightness 1; 0: unlimited
+    leak_rate: float = 0.0  # Hz, brighter events of a pixel that sees no change
+    shot_noise: float = 0.0  # Hz, noise events of a pixel in the dark
+    noise_spread: float = 0.0  # standard deviation of leak and shot noise from pixel to pixel, decades
+    dead_time: float = 0.0  # seconds
+    hot_pixels: int = 0
+    hot_rate: float = 200.0  # Hz, events of a hot pixel
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether it has no fault; its size and its thresholds are none."""
+        return (
+            max(
+                *(self.threshold_spread, self.threshold_jitter, self.bandwidth, self.leak_rate),
+                *(self.shot_noise, self.dead_time, self.hot_pixels),
+            )
+            == 0
+        )
+
+
+# Sources in docs/sensors.md.
+PRESETS: dict[SensorName, EventSensor] = {
+    "ideal": EventSensor(),
+    "typical": EventSensor(
+        positive_threshold=0.23,
+        negative_threshold=0.18,
+        threshold_spread=0.15,
+        bandwidth=200.0,
+        leak_rate=0.1,
+        shot_noise=1.5,
+        dead_time=5e-4,
+        hot_pixels=20,
+    ),
+    "davis346": EventSensor(
+        size=(346, 260),
+        positive_threshold=0.25,
+        negative_threshold=0.2,
+        threshold_spread=0.1,
+        threshold_jitter=0.03,
+        bandwidth=300.0,
+        leak_rate=0.2,
+        shot_noise=1.0,
+        noise_spread=0.2,
+        dead_time=5e-4,
+        hot_pixels=20,
+    ),
+    "dvxplorer": EventSensor(
+        size=(640, 480),
+        positive_threshold=0.25,
+        negative_threshold=0.25,
+        threshold_spread=0.08,
+        threshold_jitter=0.03,
+        bandwidth=400.0,
+        leak_rate=0.05,
+        shot_noise=0.5,
+        noise_spread=0.2,
+        dead_time=2e-4,
+        hot_pixels=40,
+    ),
+    "prophesee_gen4": EventSensor(
+        size=(1280, 720),
+        positive_threshold=0.2,
+        negative_threshold=0.2,
+        threshold_spread=0.06,
+        threshold_jitter=0.02,
+        bandwidth=800.0,
+        leak_rate=0.02,
+        shot_noise=0.3,
+        noise_spread=0.2,
+        dead_time=2e-4,
+        hot_pixels=60,
+    ),
+}
+
+
+class SensorConfig(Stage):
+    """Simulated event sensor: a preset, and what differs from it."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    shorthand: ClassVar[str | None] = "preset"
+
+    preset: SensorName = "ideal"
+    """ideal; typical: every fault, at sizes between those of real sensors; or a sensor that there is
+    (docs/sensors.md). `--sensor NAME` for short. Of a recording that is simulated."""
+    size: Annotated[tuple[int, int] | None, Field()] = None
+    """Width and height in pixels. Of this and of all below: omitted, the preset's."""
+    positive_threshold: float | None = Field(None, ge=0.01, le=10)
+    """C+: change of log brightness that fires a brighter event."""
+    negative_threshold: float | None = Field(None, ge=0.01, le=10)
+    """C- of darker events."""
+    threshold_spread: float | None = Field(None, ge=0, le=1)
+    """Standard deviation of the thresholds from pixel to pixel, as a share of them."""
+    threshold_jitter: float | None = Field(None, ge=0, le=1)
+    """Standard deviation of a pixel's threshold from event to event, as a share of it."""
+    bandwidth: float | None = Field(None, ge=0, le=1e6)
+    """Hz at brightness 1, in proportion to brightness: log brightness passes a low pass; 0: none."""
+    leak_rate: float | None = Field(None, ge=0, le=1e3)
+    """Hz, at which a pixel that sees no change fires brighter events."""
+    shot_noise: float | None = Field(None, ge=0, le=1e3)
+    """Hz, at which a dark pixel fires noise events of either polarity; a quarter of it at brightness 1."""
+    noise_spread: float | None = Field(None, ge=0, le=2)
+    """Standard deviation of both rates from pixel to pixel, decades."""
+    dead_time: float | None = Field(None, ge=0, lt=1)
+    """Seconds after an event in which a pixel is blind; its reference then is the brightness at their end."""
+    hot_pixels: int | None = Field(None, ge=0, le=1_000_000)
+    """Number of pixels that fire without cause."""
+    hot_rate: float | None = Field(None, ge=0, le=1e5)
+    """Hz, at which they fire."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, values: Any) -> Any:
+        """Take a preset's name alone, too."""
+        return {"preset": values} if isinstance(values, str) else values
+
+    @property
+    def sensor(self) -> EventSensor:
+        """The preset with what differs from it."""
+        given = {name: value for name, value in self.model_dump(exclude={"preset"}).items()}
+        return replace(PRESETS[self.preset], **{k: v for k, v in given.items() if v is not None})
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All values, for what is kept under a name of its own."""
+        return asdict(self.sensor)
