@@ -79,7 +79,9 @@ ORDERS: dict[str, list[str]] = {
         *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
         "command_line",
     ],
-    "event_images": ["change", "noisy", "sums", "solve", "contrast", "sharp"],
+    "event_images": [
+        *("change", "noisy", "sums", "solve", "contrast", "sharp", "intervals", "dead_time", "sensor"),
+    ],
     "tracking": [
         *(
             "consistency",
