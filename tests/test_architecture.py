@@ -115,6 +115,7 @@ ORDERS: dict[str, list[str]] = {
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
+        "sensor",
         *("metrics", "folder"),
     ],
     "experiments": [

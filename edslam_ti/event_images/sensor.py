@@ -51,6 +51,7 @@ class SensorEstimate:
     noise_positive_share: float | None
     hot_pixels: np.ndarray  # [P, 2] x, y, most active first
     histograms: np.ndarray = field(repr=False)  # [2, 240] intervals to the same and to the other polarity
+    numbers: np.ndarray = field(repr=False)  # [H, W] events of each pixel
 
     @property
     def short_share(self) -> float:
@@ -136,6 +137,7 @@ class SensorStatistics:
             float(self._alone[1] / alone) if is_known and alone else None,
             self._hot(),
             self._histograms,
+            self._numbers,
         )
 
     def _limit(self, k: int) -> "_Limit | None":
