@@ -68,7 +68,7 @@ def plain_pixel(
             p = 1 if filtered - reference >= positive else -1 if filtered - reference <= -negative else 0
             if p:
                 events.append((t + STEP, p))
-                reference = filtered
+                reference += positive if p > 0 else -negative  # where it was crossed, not a step later
                 blind_until = t + STEP + dead_time if dead_time else -1
     return events
 
