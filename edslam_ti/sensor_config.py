@@ -26,14 +26,18 @@ class EventSensor:
     dead_time: float = 0.0  # seconds
     hot_pixels: int = 0
     hot_rate: float = 200.0  # Hz, events of a hot pixel
+    scan_period: float = 0.0  # seconds in which all rows are read in turn; 0: pixels ask to be read
+    event_rate: float = 0.0  # events a second that are passed on at most; 0: any number
+    focal_length: float | None = None  # pixels, at `size`; None: half the width
+    distortion: tuple[float, ...] = ()  # k1 k2 k3 k4 of the lens, OpenCV's fisheye model; none: no distortion
 
     @property
     def is_ideal(self) -> bool:
-        """Whether it has no fault; its size and its thresholds are none."""
+        """Whether its pixels and its read-out have no fault; size, lens and thresholds are none."""
         return (
             max(
                 *(self.threshold_spread, self.threshold_jitter, self.bandwidth, self.leak_rate),
-                *(self.shot_noise, self.dead_time, self.hot_pixels),
+                *(self.shot_noise, self.dead_time, self.hot_pixels, self.scan_period, self.event_rate),
             )
             == 0
         )
@@ -64,6 +68,9 @@ PRESETS: dict[SensorName, EventSensor] = {
         noise_spread=0.2,
         dead_time=5e-4,
         hot_pixels=20,
+        event_rate=12e6,
+        focal_length=226.3,
+        distortion=(-0.048, 0.0113, -0.0554, 0.0215),
     ),
     "dvxplorer": EventSensor(
         size=(640, 480),
@@ -77,6 +84,10 @@ PRESETS: dict[SensorName, EventSensor] = {
         noise_spread=0.2,
         dead_time=2e-4,
         hot_pixels=40,
+        scan_period=2e-4,
+        event_rate=165e6,
+        focal_length=410.0,
+        distortion=(-0.05, 0.01, 0.0, 0.0),
     ),
     "prophesee_gen4": EventSensor(
         size=(1280, 720),
@@ -90,6 +101,10 @@ PRESETS: dict[SensorName, EventSensor] = {
         noise_spread=0.2,
         dead_time=2e-4,
         hot_pixels=60,
+        scan_period=2e-5,
+        event_rate=1.066e9,
+        focal_length=740.0,
+        distortion=(-0.05, 0.01, 0.0, 0.0),
     ),
 }
 
@@ -127,6 +142,14 @@ class SensorConfig(Stage):
     """Number of pixels that fire without cause."""
     hot_rate: float | None = Field(None, ge=0, le=1e5)
     """Hz, at which they fire."""
+    scan_period: float | None = Field(None, ge=0, le=1)
+    """Seconds in which all rows are read in turn, which gives events their time stamps; 0: their own."""
+    event_rate: float | None = Field(None, ge=0, le=1e12)
+    """Events a second that are passed on at most: more wait, and are lost after 10 ms; 0: any number."""
+    focal_length: float | None = Field(None, ge=1, le=1e5)
+    """Pixels, at the sensor's size."""
+    distortion: tuple[float, ...] | None = None
+    """k1 k2 k3 k4 of the lens, OpenCV's fisheye model; four zeros: none."""
 
     @model_validator(mode="before")
     @classmethod

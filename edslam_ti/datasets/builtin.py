@@ -65,7 +65,13 @@ def builtin_sequence_folder(
     moving = moving_object(room, path) if settings.moving_object else None
     if folder.is_dir():  # simulated before recordings had novel views
         write_evaluation_truth(
-            folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
+            folder,
+            room.scene,
+            settings.camera,
+            settings.samples_per_pixel,
+            path.pose,
+            settings.duration,
+            settings.lens,
         )
         return folder
     if progress is not None:

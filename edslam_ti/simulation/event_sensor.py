@@ -14,6 +14,7 @@ from edslam_ti.kernels.event_simulation import (
     simulate_events,
 )
 from edslam_ti.sensor_config import EventSensor
+from edslam_ti.simulation.readout import Readout
 from edslam_ti.simulation.settings import SimulationConfig
 
 SECOND = 1_000_000_000  # nanoseconds
@@ -79,6 +80,8 @@ class _FaultySensor:
         )
         self._state = _first_state(self._traits, log_first, rng)
         self._log, self._now = log_first, 0
+        sensor = self._sensor
+        self._readout = Readout(log_first.shape[0], sensor.scan_period, sensor.event_rate)
 
     def advance(self, log_next: np.ndarray, until: int) -> EventArrays:
         events = sensed_events(
@@ -95,7 +98,7 @@ class _FaultySensor:
             self._seed,
         )
         self._log, self._now = log_next, until
-        return events
+        return self._readout.passed_on(events, until)
 
 
 def thresholds(config: SimulationConfig) -> tuple[float, float]:

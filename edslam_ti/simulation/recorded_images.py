@@ -68,14 +68,14 @@ class DepthWriter:
     times: set[int]  # nanoseconds
     config: SimulationConfig
     path: CameraPath
-    renderer: MovingRenderer
+    renderer: MovingRenderer  # of the pinhole camera that depth is registered to
 
     def add(self, t: int, render: Render) -> None:
         """Write a depth image if its stamp is `t`; `render` is what the event camera sees then."""
         if t not in self.times:
             return
         sensor = self.config.depth_measured_by
-        if sensor.is_displaced:
+        if sensor.is_displaced or self.config.lens is not None:
             seconds = min(max(t / 1e9 - sensor.time_offset, 0.0), self.path.duration)
             render = self.renderer.render(self.path.pose(seconds) @ _displacement(sensor), seconds)
         depth = render.depth

@@ -80,7 +80,9 @@ def simulate(
         )
     end = round(duration * 1e9)
     check_replaceable(out, why_not_a_recording)
-    renderer = MovingRenderer(scene, moving, config.camera, config.samples_per_pixel)
+    lens = config.lens
+    renderer = MovingRenderer(scene, moving, config.camera, config.samples_per_pixel, lens)
+    pinhole = renderer if lens is None else MovingRenderer(scene, moving, config.camera, 1)
     times = _FrameTimes(config, path, sorted({*image_times, *depth_times, end}))
     with atomic_folder(out, why_not_a_recording) as folder:
         for name in ("images", "depth"):
@@ -89,7 +91,7 @@ def simulate(
         threshold = folder / f"event_threshold_{known}"
         threshold.mkdir()
         images = ImageWriter(folder / "images", image_times, config.exposure)
-        depths = DepthWriter(folder / "depth", set(depth_times), config, path, renderer)
+        depths = DepthWriter(folder / "depth", set(depth_times), config, path, pinhole)
         now, num_frames = 0, 1
         render = renderer.render(path.pose(0.0), 0.0)
         sensor = make_sensor(config, _log_intensity(render, config))
@@ -115,7 +117,9 @@ def simulate(
             pose_times = _millisecond_times(config.pose_rate, duration)
         _write_poses(folder, path, pose_times)
         _write_descriptions(folder, scene, config)
-        write_evaluation_truth(folder, scene, config.camera, config.samples_per_pixel, path.pose, end / 1e9)
+        write_evaluation_truth(
+            folder, scene, config.camera, config.samples_per_pixel, path.pose, end / 1e9, lens
+        )
     return RecordingSummary(out, events.count, num_frames, len(image_times), len(depth_times), duration)
 
 
@@ -271,6 +275,9 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "contrast_threshold": config.contrast_threshold if config.states_threshold else None,
         "depth_scale": DEPTH_UNITS_PER_METRE,
         "exposure": config.exposure,
+        "distortion_model": None if config.lens is None else config.lens.model,
+        "distortion": None if config.lens is None else list(config.lens.coefficients),
+        "depth_undistorted": None if config.lens is None else True,
         "description": scene.description,
     }
     stated = {name: value for name, value in values.items() if value is not None}

@@ -10,6 +10,7 @@ from edslam_ti.sensor_config import DEPTH_PRESETS, DepthSensor, DepthSensorConfi
 
 if TYPE_CHECKING:  # reading options must not load numpy
     from edslam_ti.camera import Camera
+    from edslam_ti.lenses import Lens
 
 DAY = 86400.0  # seconds, the longest recording
 Stretch = tuple[Annotated[float, Field(ge=0, le=DAY)], Annotated[float, Field(ge=0, le=DAY)]]
@@ -25,7 +26,7 @@ class SimulationConfig(Stage):
     height: int = Field(240, ge=8, le=4096)
     """Image height in pixels."""
     focal_length: float | None = Field(None, ge=1, le=1e5)
-    """fx = fy in pixels; omitted: half the width (90 degrees, as EventReplica)."""
+    """fx = fy in pixels; omitted: the sensor's, or half the width (90 degrees, as EventReplica)."""
     duration: float = Field(2.5, gt=0, le=DAY)
     """Length of the recording in seconds."""
     contrast_threshold: float = Field(0.1, ge=0.01, le=10)
@@ -112,5 +113,18 @@ class SimulationConfig(Stage):
         """The pinhole camera, principal point in the middle of the image."""
         from edslam_ti.camera import Camera
 
+        sensor = self.sensor.sensor
         f = self.focal_length or 0.5 * self.width
+        if self.focal_length is None and sensor.focal_length is not None:
+            f = sensor.focal_length * self.width / (sensor.size or (self.width,))[0]
         return Camera(self.width, self.height, f, f, (self.width - 1) / 2, (self.height - 1) / 2)
+
+    @property
+    def lens(self) -> "Lens | None":
+        """What distorts the event camera's view; None: nothing does."""
+        from edslam_ti.lenses import Lens
+
+        coefficients = self.sensor.sensor.distortion
+        if not any(coefficients):
+            return None
+        return Lens(self.camera, "equidistant", coefficients)
