@@ -122,7 +122,8 @@ ORDERS: dict[str, list[str]] = {
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
         *("kernel_times", "front_end", "steps", "benchmark"),
         *("jobs", "scheduler", "published", "paper_options", "paper_plan", "table_text", "paper_tables"),
-        *("paper_views", "paper_figures", "html_report", "paper_store", "paper", "long_runs", "command"),
+        *("paper_views", "paper_figures", "html_report", "paper_store", "paper", "long_runs"),
+        *("sensor_statistics", "command"),
     ],
 }
 

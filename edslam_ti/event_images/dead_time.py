@@ -16,6 +16,7 @@ MAX_PAIRS = 6
 HISTORY = 0.1  # s before a pair that are searched for the last event of a pixel
 SHARES = np.linspace(0, 1, 9)  # of the shortest interval: the dead times that are tried
 SURE = 3.0  # standard deviations of the gain in rms over none at all
+EXCLUDED = 6  # there is none if this share of the shortest interval explains the change clearly worse
 SHARP = 0.03  # gain beyond which the best dead time is believed
 MIN_PIXELS = 200
 
@@ -56,7 +57,7 @@ def dead_time_from_images(
         gains.append(1 - part[best] / part[0])
     deviation = float(np.sqrt((len(known) - 1) * np.var(gains)))
     if best == 0 or gain[best] < max(SHARP, SURE * deviation):
-        return FoundDeadTime(0.0, best == 0)
+        return FoundDeadTime(0.0, is_sure=bool(best == 0 and gain[EXCLUDED] < -SHARP))
     share = SHARES[best]
     if best < len(SHARES) - 1:  # the lowest point of the parabola through three
         left, middle, right = misfit[best - 1 : best + 2]

@@ -53,6 +53,13 @@ class SensorEstimate:
     histograms: np.ndarray = field(repr=False)  # [2, 240] intervals to the same and to the other polarity
     numbers: np.ndarray = field(repr=False)  # [H, W] events of each pixel
 
+    def interval_quantile(self, share: float) -> float | None:
+        """Return the time (s) that a share of the intervals between a pixel's events stays below."""
+        total = np.cumsum(self.histograms.sum(0))
+        if total[-1] == 0:
+            return None
+        return float(EDGES[1:][np.searchsorted(total, share * total[-1])])
+
     @property
     def short_share(self) -> float:
         """Share of the intervals shorter than twice the dead time: half the change or more was lost there."""
@@ -72,8 +79,9 @@ class _Limit:
 class SensorStatistics:
     """Gathers what `estimate` needs from stretches of events without a break."""
 
-    def __init__(self, shape: tuple[int, int]) -> None:  # (H, W)
-        self._shape = shape
+    def __init__(self, shape: tuple[int, int], where: np.ndarray | None = None) -> None:  # (H, W), [H, W]
+        """`where`: pixels whose noise counts; None: all."""
+        self._shape, self._where = shape, where
         self._numbers = np.zeros(shape, np.int64)
         self._positive = 0
         self._histograms = np.zeros((2, len(EDGES) - 1), np.int64)
@@ -112,6 +120,7 @@ class SensorStatistics:
         for k in range(1, len(images) - 1):
             around = np.maximum(widened[k - 1], widened[k + 1])
             quiet = np.maximum(around, cv2.dilate(active[k], kernel)) == 0
+            quiet = quiet if self._where is None else quiet & self._where
             self._quiet += float(quiet.sum()) * QUIET_BIN
             self._alone += images[k][quiet].sum(0, dtype=np.int64)
 
@@ -178,9 +187,10 @@ def estimate_sensor(
     sequence: EventDepthSequence,
     start: float,  # seconds
     end: float,
+    where: np.ndarray | None = None,  # [H, W] bool, pixels whose noise counts; None: all
 ) -> SensorEstimate:
     """Return what the events in [start, end], and the images there, say about the sensor."""
-    statistics = SensorStatistics(sequence.camera.shape)
+    statistics = SensorStatistics(sequence.camera.shape, where)
     for begin in _window_starts(start, end):
         events = sequence.events(begin, min(begin + WINDOW, end))
         statistics.add(events[:MOST_EVENTS])

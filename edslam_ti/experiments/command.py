@@ -198,6 +198,35 @@ def _paper(name: str, options: PaperOptions) -> None:
     reproduce_paper(TABLES if name == "all" else (name,), options)
 
 
+class SensorOptions(Stage):
+    """Recordings, and output of the table."""
+
+    data_dir: Path = Path("data")
+    """Folder with slider_depth/, real_events/ and aedat4/; what is not there is left out."""
+    scene: str = "office0"
+    """Built-in room that every simulated sensor records."""
+    duration: float = 0.5
+    """Seconds of it."""
+    width: int = 346
+    """Largest width in pixels; sensors with more pixels are made smaller."""
+    store: Path | None = None
+    """Checkout whose docs/results also receives the table; `edslam reproduce report` shows it."""
+    threads: int = 2
+    """CPU threads."""
+
+
+def sensors(options: SensorOptions) -> None:
+    """Compare statistics of events of simulated sensors with those of real ones."""
+    load_kernels()
+    from edslam_ti import kernels
+    from edslam_ti.experiments.sensor_statistics import compare_sensors
+
+    kernels.init("cpu", threads=options.threads)
+    compare_sensors(
+        options.scene, options.duration, options.width, options.data_dir, options.store, Console()
+    )
+
+
 class ReportOptions(Stage):
     """Documents to update."""
 
@@ -226,5 +255,6 @@ COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
     "runtime": (PaperOptions, runtime),
     "all": (PaperOptions, everything),
     "long": (LongOptions, long),
+    "sensors": (SensorOptions, sensors),
     "report": (ReportOptions, report),
 }

@@ -159,7 +159,8 @@ def _describe_sensor(run: Run, path: Path) -> Metrics | None:
     """Draw what the recording says about its event sensor; return it. None: there are no events."""
     if not run.sequence.has_events:
         return None
-    estimate = estimate_sensor(run.sequence, *(float(t) for t in run.samples.timestamps[[0, -1]]))
+    first, last = (float(t) for t in run.samples.timestamps[[0, -1]])
+    estimate = estimate_sensor(run.sequence, first, last)
     for line in sensor_lines(estimate, run.contrast):
         run.note(f"sensor: {line}")
     plot_sensor(estimate, run.contrast, path)
