@@ -47,6 +47,7 @@ class Option:
     path: tuple[str, ...]  # the stages that lead to the field, and its name
     kind: Any  # type of its value
     field: FieldInfo
+    is_shorthand: bool = False  # `--STAGE VALUE` sets it, too
 
     @property
     def shown(self) -> Shown | None:
@@ -63,7 +64,8 @@ class Option:
         """The flag, then its former names."""
         *stages, name = self.path
         names = [name, *former_names(self.field)]
-        return ["--" + ".".join([*stages, n]).replace("_", "-") for n in names]
+        paths = [[*stages, n] for n in names] + ([stages] if self.is_shorthand else [])
+        return ["--" + ".".join(path).replace("_", "-") for path in paths]
 
     @property
     def label(self) -> str:
@@ -84,7 +86,8 @@ def options_of(model: type[BaseModel], stages: tuple[str, ...] = ()) -> list[Opt
         if _is_model(kind):
             nested += options_of(kind, (*stages, name))
         else:
-            own.append(Option((*stages, name), kind, field))
+            is_shorthand = bool(stages) and getattr(model, "shorthand", None) == name
+            own.append(Option((*stages, name), kind, field, is_shorthand))
     return own + nested
 
 

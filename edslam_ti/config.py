@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 
 from edslam_ti.errors import ConfigError, EdSlamError, plain
 from edslam_ti.rgbd_config import SmallGicpConfig, SplatamConfig
+from edslam_ti.sensor_config import DepthSensorConfig, SensorConfig
 from edslam_ti.stage import Stage
 
 CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: settings for a data set
@@ -343,6 +344,8 @@ class Config(Stage):
     """CPU threads of the kernels; results are identical for the same number."""
     seed: int = Field(0, ge=0)
     """Seed of every random choice."""
+    sensor: SensorConfig = SensorConfig()
+    depth_sensor: DepthSensorConfig = DepthSensorConfig()
     time_surface: TimeSurfaceConfig = TimeSurfaceConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()

@@ -1,7 +1,7 @@
 """The base of every stage's settings, and of every command's options."""
 
 import difflib
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -12,6 +12,7 @@ class Stage(BaseModel):
     """Base of every stage's settings, and of every command's options: immutable, no unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    shorthand: ClassVar[str | None] = None  # the field that `--STAGE VALUE` sets, too
 
     @classmethod
     def validated(cls, values: dict[str, Any], source: str) -> Self:

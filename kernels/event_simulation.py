@@ -14,12 +14,12 @@ Times are whole nanoseconds. Two passes, count and fill, need no atomics; events
 then by pixel.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from edslam_ti.kernels.engine import ti
+from edslam_ti.kernels.hashing import hashed_normal
 from edslam_ti.kernels.runtime import check_shape
 
 MIN_THRESHOLD = 0.01  # ESIM's lower bound of a noisy threshold
@@ -51,24 +51,6 @@ class EventArrays:
     y: np.ndarray  # [N] int16, row
     t: np.ndarray  # [N] int64, nanoseconds
     polarity: np.ndarray  # [N] int8, -1 or +1
-
-
-@ti.func
-def _hash(value: ti.u32) -> ti.u32:
-    """PCG output permutation: every input bit changes about half of the output bits."""
-    state = value * ti.u32(747796405) + ti.u32(2891336453)
-    word = ((state >> ((state >> ti.u32(28)) + ti.u32(4))) ^ state) * ti.u32(277803737)
-    return (word >> ti.u32(22)) ^ word
-
-
-@ti.func
-def _normal(seed: ti.u32, pixel: ti.u32, k: ti.u32) -> ti.f64:
-    """Box-Muller from two hashed uniforms in (0, 1)."""
-    first = _hash(_hash(_hash(seed) ^ pixel) ^ k)
-    second = _hash(first ^ ti.u32(0x9E3779B9))
-    u1 = (ti.cast(first, ti.f64) + ti.f64(0.5)) * ti.f64(2.0**-32)
-    u2 = (ti.cast(second, ti.f64) + ti.f64(0.5)) * ti.f64(2.0**-32)
-    return ti.sqrt(ti.f64(-2.0) * ti.log(u1)) * ti.cos(ti.f64(2.0 * math.pi) * u2)
 
 
 @ti.kernel
@@ -111,7 +93,7 @@ def _cross_thresholds(
             while crossing:
                 threshold = base
                 if sigma > 0:
-                    noise = _normal(
+                    noise = hashed_normal(
                         seed, ti.cast(row * log_start.shape[1] + column, ti.u32), ti.cast(k, ti.u32)
                     )
                     threshold = ti.max(ti.f64(MIN_THRESHOLD), base + sigma * noise)
@@ -184,12 +166,23 @@ def simulate_events(
     ends = np.cumsum(counts, dtype=np.int64).reshape(shape)
     total = int(ends[-1, -1])
     times, x, y, polarity = launch(1, ends - counts, total)
-    # With time and slot in one 64-bit key, an unstable sort of keys sorts times stably, ten times faster.
-    slot_bits = max(int(total).bit_length(), 1)
-    if (end - start).bit_length() + slot_bits > 63:
-        order = np.argsort(times, kind="stable")
-    else:
-        keys = ((times - start) << slot_bits) | np.arange(total)
-        keys.sort()
-        order = keys & ((1 << slot_bits) - 1)
+    order = order_in_time(times, start, end)
     return EventArrays(x[order], y[order], times[order], polarity[order])
+
+
+def order_in_time(
+    t: np.ndarray,  # [N] int64 ns, within [start, end]
+    start: int,
+    end: int,
+) -> np.ndarray:  # [N] int64
+    """Return the stable order of times.
+
+    With time and slot in one 64-bit key, an unstable sort of keys sorts times stably, ten times faster.
+    """
+    slot_bits = max(len(t).bit_length(), 1)
+    if (end - start).bit_length() + slot_bits > 63:
+        return np.argsort(t, kind="stable")
+    keys = ((t - start) << slot_bits) | np.arange(len(t))
+    keys.sort()
+    order: np.ndarray = keys & ((1 << slot_bits) - 1)
+    return order

@@ -15,7 +15,17 @@ RANKS: list[list[str]] = [
         *("open3d_loader", "ply_check", "mesh_reading", "cold_start", "interruption"),
         *("patient_console", "object_graph"),
     ],
-    ["stage", "rgbd_config", "config", "arguments", "geometry", "camera", "events", "tables"],
+    [
+        "stage",
+        "rgbd_config",
+        "sensor_config",
+        "config",
+        "arguments",
+        "geometry",
+        "camera",
+        "events",
+        "tables",
+    ],
     [
         *("trajectory", "truth", "journal", "depth_images", "lenses", "depth_reprojection", "ray_casting"),
         *("alignment", "simulation", "event_files"),
@@ -40,7 +50,17 @@ ORDERS: dict[str, list[str]] = {
         *("errors", "memory", "leftovers", "output", "cache"),
         *("open3d_loader", "ply_check", "mesh_reading", "kernels", "cold_start", "interruption"),
         *("patient_console", "object_graph"),
-        *("stage", "rgbd_config", "config", "arguments", "geometry", "camera", "events", "tables"),
+        *(
+            "stage",
+            "rgbd_config",
+            "sensor_config",
+            "config",
+            "arguments",
+            "geometry",
+            "camera",
+            "events",
+            "tables",
+        ),
         *(
             "trajectory",
             "truth",
@@ -59,7 +79,9 @@ ORDERS: dict[str, list[str]] = {
         *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
         "command_line",
     ],
-    "event_images": ["change", "noisy", "sums", "solve", "contrast", "sharp"],
+    "event_images": [
+        *("change", "noisy", "sums", "solve", "contrast", "sharp", "intervals", "dead_time", "sensor"),
+    ],
     "tracking": [
         *(
             "consistency",
@@ -93,13 +115,15 @@ ORDERS: dict[str, list[str]] = {
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
+        "sensor",
         *("metrics", "folder"),
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
         *("kernel_times", "front_end", "steps", "benchmark"),
         *("jobs", "scheduler", "published", "paper_options", "paper_plan", "table_text", "paper_tables"),
-        *("paper_views", "paper_figures", "html_report", "paper_store", "paper", "long_runs", "command"),
+        *("paper_views", "paper_figures", "html_report", "paper_store", "paper", "long_runs"),
+        *("sensor_statistics", "command"),
     ],
 }
 
@@ -110,7 +134,7 @@ LIBRARIES: dict[str, list[str]] = {
     "libusb_package": ["open3d_loader"],
     "pydantic": [
         "experiments.paper_options",
-        *("stage", "rgbd_config", "config"),
+        *("stage", "rgbd_config", "sensor_config", "config"),
         "arguments",
         "checkpoint",
         "command_line",

@@ -32,6 +32,7 @@ from edslam_ti.datasets.rpg import RpgSequence, is_rpg
 from edslam_ti.datasets.tum_vie import TumVieSequence, is_tum_vie
 from edslam_ti.datasets.vector import VectorSequence, is_vector
 from edslam_ti.errors import ConfigError, plain
+from edslam_ti.sensor_config import DepthSensorConfig, SensorConfig
 
 __all__ = [
     "FORMATS",
@@ -56,7 +57,7 @@ class Format:
     open: Callable[[Path, Config], EventDepthSequence]  # from the folder of one scene
     detect: Callable[[Path], bool]  # whether a folder holds such a sequence
     scenes: Callable[[], Sequence[str]] = tuple  # scenes that need no data; `make` makes them
-    make: Callable[[str], Path] | None = None  # returns a scene's folder, made on first use
+    make: Callable[[str, Config], Path] | None = None  # returns a scene's folder, made on first use
 
 
 class Found(NamedTuple):
@@ -78,10 +79,13 @@ def _open_builtin(folder: Path, config: Config) -> EventDepthSequence:
     return BuiltinSequence(folder, config.contrast_threshold)
 
 
-def _make_builtin(scene: str) -> Path:
+def _make_builtin(scene: str, config: Config) -> Path:
     from edslam_ti.datasets.builtin import builtin_sequence_folder
+    from edslam_ti.simulation.settings import SimulationConfig
 
-    return builtin_sequence_folder(scene)
+    return builtin_sequence_folder(
+        scene, SimulationConfig(sensor=config.sensor, depth_sensor=config.depth_sensor)
+    )
 
 
 # The choices of --dataset. Without it, a recording in the first format takes precedence over all others, and
@@ -197,11 +201,20 @@ def open_sequence(config: Config) -> EventDepthSequence:
                 f"{key}: expected with event_replica alone, got it with {found.dataset}, whose files state "
                 "the times of images; leave it out"
             )
+    for key, is_changed in (
+        ("sensor", config.sensor != SensorConfig()),
+        ("depth_sensor", config.depth_sensor != DepthSensorConfig()),
+    ):
+        if is_changed and found.dataset != "builtin":
+            raise ConfigError(
+                f"{key}: expected with built-in rooms alone, which are simulated, got it with "
+                f"{found.dataset}; leave it out"
+            )
     format = FORMATS[found.dataset]
     folder = found.folder
     if folder is None:
         assert format.make is not None, f"{found.dataset}: has scenes but no way to make them"
-        folder = format.make(config.scene)
+        folder = format.make(config.scene, config)
     sequence = format.open(folder, config)
     if config.crop and found.dataset != "vector":
         raise ConfigError(f"crop: expected with vector alone, got it with {found.dataset}; leave it out")

@@ -1,6 +1,7 @@
 """The built-in sequences: simulated once and kept in the user's cache folder."""
 
 import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,16 @@ GENERATOR_VERSION = 2  # increase it when rooms, paths or rendering change, so t
 
 # Settings added since GENERATOR_VERSION was last increased. Their defaults change nothing, so recordings made
 # before stay valid.
-NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events", "moving_object")
+NEW_SETTINGS = (
+    "path",
+    "pose_rate",
+    "event_gap",
+    "depth_gap",
+    "compact_events",
+    "moving_object",
+    "sensor",
+    "depth_sensor",
+)
 
 
 class BuiltinSequence(EventReplicaSequence):
@@ -41,7 +51,7 @@ def builtin_sequence_folder(
     setting, so changed settings never use old data.
     """
     settings = config or SimulationConfig()
-    key = f"{GENERATOR_VERSION} {settings.model_dump_json(exclude=_unchanged(settings))}"
+    key = f"{GENERATOR_VERSION} {key_of(settings)}"
     version = hashlib.sha256(key.encode()).hexdigest()[:12]
     folder = cached(Path("sequences") / version / scene)
     if (folder / "novel_views").is_dir():  # folders appear whole or not at all
@@ -55,7 +65,13 @@ def builtin_sequence_folder(
     moving = moving_object(room, path) if settings.moving_object else None
     if folder.is_dir():  # simulated before recordings had novel views
         write_evaluation_truth(
-            folder, room.scene, settings.camera, settings.samples_per_pixel, path.pose, settings.duration
+            folder,
+            room.scene,
+            settings.camera,
+            settings.samples_per_pixel,
+            path.pose,
+            settings.duration,
+            settings.lens,
         )
         return folder
     if progress is not None:
@@ -71,6 +87,11 @@ def builtin_sequence_folder(
     return folder
 
 
-def _unchanged(settings: SimulationConfig) -> set[str]:
+def key_of(settings: SimulationConfig) -> str:
+    """Return a text that differs for every other recording: a preset counts by its values."""
     fields = SimulationConfig.model_fields
-    return {name for name in NEW_SETTINGS if getattr(settings, name) == fields[name].default}
+    unchanged = {name for name in NEW_SETTINGS if getattr(settings, name) == fields[name].default}
+    text = settings.model_dump_json(exclude=unchanged | {"sensor", "depth_sensor"})
+    for name, stage in (("sensor", settings.sensor), ("depth_sensor", settings.depth_sensor)):
+        text += "" if name in unchanged else f" {name} {json.dumps(stage.facts)}"
+    return text

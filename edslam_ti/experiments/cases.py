@@ -1,8 +1,15 @@
 """The cases of the tracking benchmark: a recording, and its alterations while it is read."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from edslam_ti.sensor_config import (
+    DEPTH_PRESETS,
+    DepthSensorConfig,
+    DepthSensorName,
+    SensorConfig,
+    SensorName,
+)
 from edslam_ti.simulation import ROOM_NAMES, SimulationConfig
 from edslam_ti.simulation.catalogue import UNSEEN_ROOM_NAMES
 
@@ -25,6 +32,8 @@ class Recording:
     speed: float = 1.0
     seed: int = 0
     duration: float = DURATION
+    sensor: SensorName = "ideal"
+    depth_sensor: DepthSensorName = "exact"
 
     @property
     def settings(self) -> SimulationConfig:
@@ -36,6 +45,8 @@ class Recording:
             duration=self.duration,
             pose_rate=POSE_RATE,
             compact_events=True,
+            sensor=SensorConfig(preset=self.sensor),
+            depth_sensor=DepthSensorConfig(preset=self.depth_sensor),
         )
 
 
@@ -45,7 +56,7 @@ class Case:
 
     group: str  # aspect that it tests
     recording: Recording
-    depth: str = "exact"  # or kinect, measured
+    depth: str = "exact"  # or kinect, measured, or the depth sensor's name
     rate: float = 20.0  # depth images per second
     event_gap: tuple[float, float] | None = None
     depth_gap: tuple[float, float] | None = None
@@ -61,6 +72,8 @@ class Case:
             words.append(f"{recording.duration:g}s")
         if recording.speed != 1:
             words.append(f"x{recording.speed:g}")
+        if recording.sensor != "ideal":
+            words.append(recording.sensor)
         if self.event_gap:
             words.append("event_gap")
         if self.depth_gap:
@@ -98,6 +111,24 @@ def all_cases(seeds: Sequence[int] = (0, 1, 2)) -> list[Case]:
     cases.sort(key=lambda case: (case.recording.seed, _order(case)))
     recordings = list(dict.fromkeys(case.recording for case in cases))
     return sorted(cases, key=lambda case: recordings.index(case.recording))
+
+
+def with_sensors(cases: Sequence[Case], sensor: SensorName, depth_sensor: DepthSensorName) -> list[Case]:
+    """Return the cases as other sensors record them; recorded data stay as they are.
+
+    A depth sensor other than exact takes the place of all kinds and rates of depth.
+    """
+    result = []
+    for case in cases:
+        recording = case.recording
+        if recording.scene != REAL_SCENE:
+            recording = replace(recording, sensor=sensor, depth_sensor=depth_sensor)
+            case = replace(case, recording=recording)
+            if depth_sensor != "exact":
+                rate = DEPTH_PRESETS[depth_sensor].rate or recording.settings.depth_rate
+                case = replace(case, depth=depth_sensor, rate=rate)
+        result.append(case)
+    return list(dict.fromkeys(result))
 
 
 def quick_cases() -> list[Case]:

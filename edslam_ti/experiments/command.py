@@ -11,6 +11,7 @@ from edslam_ti.cold_start import load_kernels
 from edslam_ti.config import Stage
 from edslam_ti.experiments.paper_options import LongOptions, PaperOptions
 from edslam_ti.experiments.selection import Selection
+from edslam_ti.sensor_config import DepthSensorName, SensorName
 
 
 class TrackingOptions(Selection):
@@ -22,6 +23,10 @@ class TrackingOptions(Selection):
     """Folder that receives results.json, tracking.md, the pictures, and one file per run."""
     data_dir: Path = Path("data")
     """Folder with trajectories/, scenes/ and slider_depth/; cases without their data are skipped."""
+    sensor: SensorName = "ideal"
+    """Event sensor of the simulated recordings (docs/sensors.md)."""
+    depth_sensor: DepthSensorName = "exact"
+    """Their depth sensor; any but exact measures at its own rate and stands for all kinds of depth."""
     quick: bool = False
     """Four short cases instead of all."""
     mapping: bool = False
@@ -37,12 +42,14 @@ class TrackingOptions(Selection):
 def tracking(options: TrackingOptions) -> None:
     """Run methods on the cases of the tracking benchmark."""
     load_kernels()
-    from edslam_ti.experiments.cases import all_cases, quick_cases
+    from edslam_ti.experiments.cases import all_cases, quick_cases, with_sensors
     from edslam_ti.experiments.recordings import Recordings
     from edslam_ti.experiments.report import write_report
     from edslam_ti.experiments.runs import methods_as_variants, run_all
 
-    cases = [case for case in (quick_cases() if options.quick else all_cases()) if options.includes(case)]
+    cases = quick_cases() if options.quick else all_cases()
+    cases = with_sensors(cases, options.sensor, options.depth_sensor)
+    cases = [case for case in cases if options.includes(case)]
     if not cases:
         raise UsageError("no case passes the filters; leave some out")
     variants = methods_as_variants(options.methods, options.mapping)
@@ -191,6 +198,35 @@ def _paper(name: str, options: PaperOptions) -> None:
     reproduce_paper(TABLES if name == "all" else (name,), options)
 
 
+class SensorOptions(Stage):
+    """Recordings, and output of the table."""
+
+    data_dir: Path = Path("data")
+    """Folder with slider_depth/, real_events/ and aedat4/; what is not there is left out."""
+    scene: str = "office0"
+    """Built-in room that every simulated sensor records."""
+    duration: float = 0.5
+    """Seconds of it."""
+    width: int = 346
+    """Largest width in pixels; sensors with more pixels are made smaller."""
+    store: Path | None = None
+    """Checkout whose docs/results also receives the table; `edslam reproduce report` shows it."""
+    threads: int = 2
+    """CPU threads."""
+
+
+def sensors(options: SensorOptions) -> None:
+    """Compare statistics of events of simulated sensors with those of real ones."""
+    load_kernels()
+    from edslam_ti import kernels
+    from edslam_ti.experiments.sensor_statistics import compare_sensors
+
+    kernels.init("cpu", threads=options.threads)
+    compare_sensors(
+        options.scene, options.duration, options.width, options.data_dir, options.store, Console()
+    )
+
+
 class ReportOptions(Stage):
     """Documents to update."""
 
@@ -219,5 +255,6 @@ COMMANDS: dict[str, tuple[type[Stage], Callable[[Any], None]]] = {
     "runtime": (PaperOptions, runtime),
     "all": (PaperOptions, everything),
     "long": (LongOptions, long),
+    "sensors": (SensorOptions, sensors),
     "report": (ReportOptions, report),
 }

@@ -30,6 +30,14 @@ from edslam_ti.config import Config, dataset_differences
 from edslam_ti.errors import EdSlamError
 from edslam_ti.methods import METHODS
 from edslam_ti.output import atomic_file
+from edslam_ti.sensor_config import (
+    DEPTH_PRESETS,
+    PRESETS,
+    DepthSensorConfig,
+    DepthSensorName,
+    SensorConfig,
+    SensorName,
+)
 
 EXACT, KINECT, RECORDED = "exact", "kinect", "recorded"  # kinds of depth; recorded: as it is in the data
 BUILTIN_RATE = 20.0  # depth images per second of built-in recordings
@@ -40,7 +48,13 @@ KEPT = (
     "trajectory_frontend_tum.txt",
     "trajectory.png",
 )
-ADDED = ("path", "moving_object", "size")  # fields that were added when there were results already
+ADDED = (
+    "path",
+    "moving_object",
+    "size",
+    "sensor",
+    "depth_sensor",
+)  # fields that were added when there were results already
 KEPT_VIEWS = 3  # pictures of held-out views
 MAPS = ("map.ply", "points.ply")  # the first that there is states the size of the map
 LONGEST_MESSAGE = 300  # characters; compilers write long messages
@@ -73,28 +87,40 @@ class Job:
     device: str = "cpu"
     path: str = "hand_held"  # of a built-in recording; the following, too
     moving_object: bool = False
-    size: tuple[int, int] | None = None  # pixels; None: 384 x 240
+    size: tuple[int, int] | None = None  # pixels; None: the sensor's, 384 x 240 of most
+    sensor: SensorName = "ideal"
+    depth_sensor: DepthSensorName = "exact"  # another one measures at its own rate
 
     @property
     def data(self) -> str:
         """What the run's numbers are from, in words."""
         if self.dataset == "builtin":
-            noise = "exact" if self.depth == EXACT else "Kinect-like"
             length = 2.5 if self.duration is None else self.duration
             words = ["simulated flat" if self.path == "tour" else "simulated room"]
-            words.append(f"{noise} depth {self.rate:g} Hz, {length:g} s")
+            words.append(f"{self._depth_in_words} Hz, {length:g} s")
             if self.path not in ("hand_held", "tour"):
                 words.append(self.path)
-            if self.size is not None:
-                words.append("{}x{}".format(*self.size))
+            if self.sensor != "ideal":
+                words.append(f"sensor {self.sensor}")
+            size = self.size or PRESETS[self.sensor].size
+            if size is not None:
+                words.append("{}x{}".format(*size))
             return ", ".join([*words, *(["moving object"] if self.moving_object else [])])
         length_text = "" if self.duration is None else f", first {self.duration:g} s"
         return f"recording ({self.dataset}){length_text}"
 
     @property
+    def _depth_in_words(self) -> str:
+        if self.depth_sensor != "exact":
+            return f"{self.depth_sensor} depth {DEPTH_PRESETS[self.depth_sensor].rate or self.rate:g}"
+        return f"{'exact' if self.depth == EXACT else 'Kinect-like'} depth {self.rate:g}"
+
+    @property
     def name(self) -> str:
         """The job's folder, below the folder of all: readable, and another for every other job."""
-        kind = f"{self.depth}-{self.rate:g}hz" if self.dataset == "builtin" else RECORDED
+        depth = self.depth if self.depth_sensor == "exact" else self.depth_sensor
+        kind = f"{depth}-{self.rate:g}hz" if self.dataset == "builtin" else RECORDED
+        kind = kind if self.sensor == "ideal" else f"{self.sensor}-{kind}"
         facts = {name: value for name, value in asdict(self).items() if self._counts(name)}
         if self.dataset == "builtin":
             del facts["data_dir"]
@@ -119,6 +145,8 @@ class Job:
             seed=self.seed,
             threads=self.threads,
             device=self.device,
+            sensor=SensorConfig(preset=self.sensor),
+            depth_sensor=DepthSensorConfig(preset=self.depth_sensor),
         )
         config = config.updated(dataset_differences(self.dataset))
         config = config.updated(dict(METHODS[self.method].overrides))
@@ -223,7 +251,8 @@ def _opened(job: Job, config: Config, console: Any) -> Any:
     if job.size is not None:
         differences |= {"width": job.size[0], "height": job.size[1]}
     settings = SimulationConfig(
-        seed=job.seed, path=job.path, moving_object=job.moving_object, **differences
+        seed=job.seed, path=job.path, moving_object=job.moving_object, sensor=config.sensor,
+        depth_sensor=config.depth_sensor, **differences,
     )  # fmt: skip
     with locked(cached(Path("sequences")) / f".{job.scene}.lock"):  # another job may be making it now
         made = builtin_sequence_folder(job.scene, settings, lambda share: None)

@@ -6,6 +6,7 @@ from typing import Literal
 from pydantic import Field
 
 from edslam_ti.config import Stage
+from edslam_ti.sensor_config import DepthSensorName, SensorName
 
 
 class LongOptions(Stage):
@@ -53,6 +54,10 @@ class PaperOptions(Stage):
     """Depth of built-in rooms: exact, kinect."""
     rates: tuple[float, ...] = (20.0,)
     """Depth images per second of built-in rooms."""
+    sensor: tuple[SensorName, ...] = ("ideal",)
+    """Event sensors of built-in rooms (docs/sensors.md); several are shown side by side."""
+    depth_sensor: tuple[DepthSensorName, ...] = ("exact",)
+    """Their depth sensors; any but exact measures at its own rate, whatever `depth` and `rates` say."""
     datasets: tuple[str, ...] = ()
     """Formats of recordings, builtin for the rooms; none: the rooms, and what lies in --data-dir."""
     duration: float | None = Field(None, gt=0)

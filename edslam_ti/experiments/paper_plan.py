@@ -12,6 +12,7 @@ from edslam_ti.errors import ConfigError
 from edslam_ti.experiments.jobs import BUILTIN_RATE, EXACT, KINECT, RECORDED, Job
 from edslam_ti.experiments.published import ABLATION_SCENE, PAPER_SCENES, TABLE_1, TABLE_2
 from edslam_ti.methods import METHODS
+from edslam_ti.sensor_config import DepthSensorName, SensorName
 from edslam_ti.simulation.catalogue import SCENE_NAMES
 
 ALL = "all"
@@ -30,6 +31,8 @@ class Wanted:
     seeds: tuple[int, ...] = (0,)
     depth: tuple[str, ...] = (EXACT,)  # of built-in rooms
     rates: tuple[float, ...] = (BUILTIN_RATE,)  # of built-in rooms, Hz
+    sensor: tuple[SensorName, ...] = ("ideal",)  # of built-in rooms
+    depth_sensor: tuple[DepthSensorName, ...] = ("exact",)  # of built-in rooms
     datasets: tuple[str, ...] = ()  # keys of FORMATS; none: built-in rooms and what lies in the data folder
     duration: float | None = None  # seconds of each
     data_dir: Path = Path("data")
@@ -92,19 +95,31 @@ def _of_scenes(
     text = json.dumps(merged(json.loads(wanted.differences), differences), sort_keys=True)
     jobs = []
     for dataset, scene in recordings(wanted, scenes):
-        kinds = [(depth, rate) for depth in wanted.depth for rate in wanted.rates]
-        if dataset != "builtin":
-            kinds = [(RECORDED, 0.0)]  # as it is
-        for depth, rate in kinds:
+        for depth, rate, sensor, depth_sensor in _kinds(wanted, dataset == "builtin"):
             jobs += [
                 Job(
                     dataset, scene, method, seed, depth, rate, wanted.duration, text,
                     str(wanted.data_dir.resolve()), wanted.threads, wanted.device,
+                    sensor=sensor, depth_sensor=depth_sensor,
                 )
                 for method in methods
                 for seed in wanted.seeds
             ]  # fmt: skip
     return jobs
+
+
+def _kinds(wanted: Wanted, is_builtin: bool) -> list[tuple[str, float, SensorName, DepthSensorName]]:
+    """Return depth, its rate, event sensor and depth sensor of every run on one recording."""
+    if not is_builtin:
+        return [(RECORDED, 0.0, "ideal", "exact")]  # as it is
+    kinds: list[tuple[str, float, SensorName, DepthSensorName]] = []
+    for sensor in wanted.sensor:
+        for depth_sensor in wanted.depth_sensor:
+            if depth_sensor != "exact":
+                kinds.append((EXACT, BUILTIN_RATE, sensor, depth_sensor))
+            else:
+                kinds += [(depth, rate, sensor, "exact") for depth in wanted.depth for rate in wanted.rates]
+    return kinds
 
 
 def _is_there(data_dir: Path, dataset: str, scene: str) -> bool:
@@ -124,7 +139,10 @@ def _check(wanted: Wanted) -> None:
         unknown = [value for value in values if value not in known]
         if unknown:
             raise ConfigError(f"{what}: expected some of {', '.join(known)}, got '{unknown[0]}'")
-    for what, numbers in (("seeds", wanted.seeds), ("rates", wanted.rates)):
+    for what, numbers in (
+        *(("seeds", wanted.seeds), ("rates", wanted.rates)),
+        *(("sensor", wanted.sensor), ("depth_sensor", wanted.depth_sensor)),
+    ):
         if not numbers:
             raise ConfigError(f"{what}: expected at least one, got none")
     wrong = [rate for rate in wanted.rates if not 0 < rate <= BUILTIN_RATE]

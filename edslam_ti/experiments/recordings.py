@@ -9,7 +9,7 @@ import numpy as np
 
 from edslam_ti.cache import cached
 from edslam_ti.datasets import EventDepthSequence
-from edslam_ti.datasets.builtin import builtin_sequence_folder
+from edslam_ti.datasets.builtin import builtin_sequence_folder, key_of
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.datasets.rpg import RpgSequence
 from edslam_ti.experiments.cases import MESH_SCENE, REAL_SCENE, Recording
@@ -70,7 +70,7 @@ class Recordings:
         mesh, path = self._found(MESH_FILE), self._found(PATH_FILE)
         start = PATH_STARTS[recording.seed % len(PATH_STARTS)]
         settings = recording.settings
-        key = f"{settings.model_dump_json()} {start} {PATH_SCALE} {MESH_SCALE} {MESH_POSITION} {MESH_TARGET}"
+        key = f"{key_of(settings)} {start} {PATH_SCALE} {MESH_SCALE} {MESH_POSITION} {MESH_TARGET}"
         version = hashlib.sha256(key.encode()).hexdigest()[:12]
         folder = cached(Path("sequences") / version / MESH_SCENE)
         if not folder.is_dir():

@@ -198,7 +198,8 @@ def _attempted(
     """Return the result of a run, or the problem that ended it."""
 
     def run() -> dict[str, Any]:
-        noise = case.depth if case.depth == "kinect" else "none"
+        is_added = case.depth == "kinect" and case.recording.depth_sensor == "exact"
+        noise = "kinect" if is_added else "none"
         rate = None if case.depth == MEASURED else case.rate
         gaps = (case.event_gap, case.depth_gap)
         altered = AlteredSequence(sequence, noise, rate, *gaps, seed=case.recording.seed)

@@ -109,7 +109,10 @@ def calibrate_depth(
         if abs(next_delay) > LARGEST_DELAY or np.linalg.norm(next_rotation) > LARGEST_ROTATION:
             raise DataError(_too_far(sequence, next_delay, next_rotation))
         again = track(aligned(sequence, next_delay, next_rotation), *part, config)
-        if again is None or again.misalignment is None or disagreement(again) > disagreement(best):
+        if not _is_better(again, best):  # a short motion tells a delay and a rotation apart badly
+            next_rotation = rotation
+            again = track(aligned(sequence, next_delay, rotation), *part, config)
+        if again is None or not _is_better(again, best):
             break
         delay, rotation, best = next_delay, next_rotation, again
     return DepthCalibration(delay, rotation, sigma, best, disagreement(first), disagreement(best))
@@ -118,6 +121,10 @@ def calibrate_depth(
 def disagreement(tracked: Tracked) -> float:
     """Return by how many expected differences poses by depth and by brightness differ."""
     return float("inf") if tracked.consistency is None else float(np.sqrt(tracked.consistency.disagreement))
+
+
+def _is_better(again: Tracked | None, best: Tracked) -> bool:
+    return again is not None and again.misalignment is not None and disagreement(again) <= disagreement(best)
 
 
 def _required(tracked: Tracked | None, sequence: EventDepthSequence) -> Tracked:

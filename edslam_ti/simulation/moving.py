@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edslam_ti.camera import Camera
+from edslam_ti.lenses import Lens
 from edslam_ti.simulation import textures as tx
 from edslam_ti.simulation.paths import CameraPath, TourPath
 from edslam_ti.simulation.renderer import Render, Renderer
@@ -64,11 +65,16 @@ class MovingRenderer:
     """
 
     def __init__(
-        self, scene: Scene, moving: MovingObject | None, camera: Camera, samples_per_edge_pixel: int
+        self,
+        scene: Scene,
+        moving: MovingObject | None,
+        camera: Camera,
+        samples_per_edge_pixel: int,
+        lens: Lens | None = None,
     ) -> None:
-        self._static = Renderer(scene, camera, samples_per_edge_pixel)
+        self._static = Renderer(scene, camera, samples_per_edge_pixel, lens=lens)
         self._moving = moving
-        self._object = None if moving is None else Renderer(moving.scene, camera, 1)
+        self._object = None if moving is None else Renderer(moving.scene, camera, 1, lens=lens)
 
     def render(self, T_world_camera: np.ndarray, t: float) -> Render:  # [4, 4], seconds
         """Return image and depth from a pose at a time."""

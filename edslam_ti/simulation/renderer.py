@@ -10,6 +10,7 @@ import numpy as np
 
 from edslam_ti.camera import Camera
 from edslam_ti.kernels.texture import mark_edges, pixel_rays, shade, write_sample_means
+from edslam_ti.lenses import Lens
 from edslam_ti.ray_casting import Hits, RayCaster
 from edslam_ti.simulation.scene import Scene
 
@@ -47,9 +48,15 @@ class Renderer:
     """Ray caster of one scene and one camera."""
 
     def __init__(
-        self, scene: Scene, camera: Camera, samples_per_edge_pixel: int = 6, background: float = 0.5
+        self,
+        scene: Scene,
+        camera: Camera,
+        samples_per_edge_pixel: int = 6,
+        background: float = 0.5,
+        lens: Lens | None = None,  # of this camera; None: a pinhole
     ) -> None:
         self.camera = camera
+        self._through_lens = None if lens is None else _LensRays(lens)
         self.background = background
         self._caster = RayCaster(scene.vertices, scene.triangles)
         self._triangles = scene.triangle_table()
@@ -74,7 +81,10 @@ class Renderer:
         self, T_world_camera: np.ndarray, pixels: np.ndarray, offsets: np.ndarray, scale: float
     ) -> tuple[np.ndarray, Hits, np.ndarray, np.ndarray]:
         """Return rays, hits, grey and surface of len(pixels) * len(offsets) rays."""
-        rays = pixel_rays(T_world_camera, self.camera.intrinsics, self.camera.width, pixels, offsets)
+        if self._through_lens is not None:
+            rays = self._through_lens(T_world_camera, pixels, offsets)
+        else:
+            rays = pixel_rays(T_world_camera, self.camera.intrinsics, self.camera.width, pixels, offsets)
         return self._shaded(T_world_camera, rays, scale)
 
     def _shaded(
@@ -95,6 +105,31 @@ class Renderer:
             self.background,
         )
         return rays, hits, grey, surface
+
+
+class _LensRays:
+    """The viewing rays of a camera whose lens distorts."""
+
+    def __init__(self, lens: Lens) -> None:
+        rays = np.nan_to_num(lens.rays.astype(np.float64))  # [H, W, 2]; nothing is seen where there is none
+        self._rays = rays.reshape(-1, 2)
+        self._along = [np.gradient(rays, axis=axis).reshape(-1, 2) for axis in (1, 0)]  # per pixel in x, y
+
+    def __call__(
+        self,
+        T_world_camera: np.ndarray,  # [4, 4]
+        pixels: np.ndarray,  # [M] flat indices
+        offsets: np.ndarray,  # [S, 2] (x, y) from the pixel centre
+    ) -> np.ndarray:  # [M * S, 6] float32: origin, direction with camera z = 1
+        """Return rays; between pixel centres they are straight lines in x and y."""
+        x, y = offsets[None, :, :1], offsets[None, :, 1:]
+        at = self._rays[pixels, None] + x * self._along[0][pixels, None] + y * self._along[1][pixels, None]
+        at = at.reshape(-1, 2)
+        R, origin = T_world_camera[:3, :3], T_world_camera[:3, 3]
+        rays = np.empty((len(at), 6), np.float32)
+        rays[:, :3] = origin
+        rays[:, 3:] = at @ R[:, :2].T + R[:, 2]
+        return rays
 
 
 def _sample_offsets(count: int) -> np.ndarray:  # [S, 2] float32

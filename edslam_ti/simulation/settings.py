@@ -2,13 +2,15 @@
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError, shown
+from edslam_ti.sensor_config import DEPTH_PRESETS, DepthSensor, DepthSensorConfig, SensorConfig
 
 if TYPE_CHECKING:  # reading options must not load numpy
     from edslam_ti.camera import Camera
+    from edslam_ti.lenses import Lens
 
 DAY = 86400.0  # seconds, the longest recording
 Stretch = tuple[Annotated[float, Field(ge=0, le=DAY)], Annotated[float, Field(ge=0, le=DAY)]]
@@ -24,7 +26,7 @@ class SimulationConfig(Stage):
     height: int = Field(240, ge=8, le=4096)
     """Image height in pixels."""
     focal_length: float | None = Field(None, ge=1, le=1e5)
-    """fx = fy in pixels; omitted: half the width (90 degrees, as EventReplica)."""
+    """fx = fy in pixels; omitted: the sensor's, or half the width (90 degrees, as EventReplica)."""
     duration: float = Field(2.5, gt=0, le=DAY)
     """Length of the recording in seconds."""
     contrast_threshold: float = Field(0.1, ge=0.01, le=10)
@@ -68,7 +70,9 @@ class SimulationConfig(Stage):
     compact_events: bool = False
     """Events as float32: half the disk space; stamps are exact to 0.3 us up to 4 s, 4 us up to a minute."""
     seed: int = Field(0, ge=0, le=2**31 - 1)
-    """Seed of path, threshold noise and depth noise."""
+    """Seed of path, threshold noise, depth noise, and of all that is random in the sensor."""
+    sensor: SensorConfig = SensorConfig()
+    depth_sensor: DepthSensorConfig = DepthSensorConfig()
 
     def __init__(self, **values: Any) -> None:
         """Check the values; the first invalid one raises `ConfigError`."""
@@ -79,10 +83,48 @@ class SimulationConfig(Stage):
             name = ".".join(str(part) for part in problem["loc"])
             raise ConfigError(f"{name}: {problem['msg']}, got {shown(problem['input'])}") from error
 
+    @model_validator(mode="before")
+    @classmethod
+    def _sized_as_the_sensor(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Take the size of the sensor where none is given."""
+        if "sensor" not in values:
+            return values
+        sensor = SensorConfig.validated(values["sensor"], "sensor")
+        size = sensor.sensor.size
+        return values if size is None else {"width": size[0], "height": size[1], **values}
+
+    @property
+    def states_threshold(self) -> bool:
+        """Whether the recording says what C is: real ones do not."""
+        return self.sensor.sensor.is_ideal and self.sensor.sensor.positive_threshold is None
+
+    @property
+    def depth_measured_by(self) -> DepthSensor:
+        """The depth sensor; `depth_noise` chooses one, too."""
+        sensor = self.depth_sensor.sensor
+        if self.depth_noise == "none":
+            return sensor
+        if self.depth_sensor != DepthSensorConfig():
+            raise ConfigError("depth_noise: expected it alone or depth_sensor alone, got both; leave one out")
+        return DEPTH_PRESETS["kinect"]
+
     @property
     def camera(self) -> "Camera":
         """The pinhole camera, principal point in the middle of the image."""
         from edslam_ti.camera import Camera
 
+        sensor = self.sensor.sensor
         f = self.focal_length or 0.5 * self.width
+        if self.focal_length is None and sensor.focal_length is not None:
+            f = sensor.focal_length * self.width / (sensor.size or (self.width,))[0]
         return Camera(self.width, self.height, f, f, (self.width - 1) / 2, (self.height - 1) / 2)
+
+    @property
+    def lens(self) -> "Lens | None":
+        """What distorts the event camera's view; None: nothing does."""
+        from edslam_ti.lenses import Lens
+
+        coefficients = self.sensor.sensor.distortion
+        if not any(coefficients):
+            return None
+        return Lens(self.camera, "equidistant", coefficients)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from edslam_ti.camera import Camera
 from edslam_ti.errors import DataError
+from edslam_ti.lenses import Lens
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.output import atomic_file, atomic_folder
 from edslam_ti.ray_casting import RayCaster, rays_from
@@ -37,17 +38,20 @@ def write_evaluation_truth(
     samples_per_pixel: int,
     pose: Callable[[float], np.ndarray],  # seconds -> T_world_camera [4, 4]
     duration: float,  # seconds
+    lens: Lens | None = None,  # that distorts the images, not depth
 ) -> None:
     """Write `surfaces.ply`, then `novel_views`, into a recording's folder; Taichi must have been started."""
     write_surfaces(folder / "surfaces.ply", scene)
-    renderer = Renderer(scene, camera, samples_per_pixel)
+    renderer = Renderer(scene, camera, samples_per_pixel, lens=lens)
+    pinhole = renderer if lens is None else Renderer(scene, camera, 1)
     with atomic_folder(folder / "novel_views") as partial:
         for name in ("images", "depth"):
             (partial / name).mkdir()
         lines = []
         for ms, T_world_camera in novel_poses(scene, pose, duration):
             view = renderer.render(T_world_camera)
-            units = np.rint(view.depth.astype(np.float64) * DEPTH_UNITS_PER_METRE)
+            depth = view.depth if lens is None else pinhole.render(T_world_camera).depth
+            units = np.rint(depth.astype(np.float64) * DEPTH_UNITS_PER_METRE)
             units[units > np.iinfo(np.uint16).max] = 0
             grey = np.rint(255 * np.clip(view.grey, 0, 1)).astype(np.uint8)
             for name, image in (("images", grey), ("depth", units.astype(np.uint16))):

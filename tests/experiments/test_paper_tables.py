@@ -531,6 +531,25 @@ def test_fields_that_were_added_leave_the_names_of_finished_runs() -> None:
     assert replace(job, moving_object=True).name != job.name
 
 
+def test_sensors_are_part_of_a_runs_name_and_data_and_settings() -> None:
+    wanted = Wanted(
+        ("office0",), ("ed_slam",), depth=("exact", "kinect"), sensor=("ideal", "davis346"),
+        depth_sensor=("exact", "realsense"),
+    )  # fmt: skip
+    jobs = plan(wanted, ("table4",))["table4"]
+    data = [job.data for job in jobs]
+    assert data[:3] == [
+        "simulated room, exact depth 20 Hz, 2.5 s",
+        "simulated room, Kinect-like depth 20 Hz, 2.5 s",
+        "simulated room, realsense depth 30 Hz, 2.5 s",
+    ]
+    assert data[5] == "simulated room, realsense depth 30 Hz, 2.5 s, sensor davis346, 346x260"
+    assert len({job.name for job in jobs}) == 6
+    settings = jobs[5].settings(Path())
+    assert (settings.sensor.preset, settings.depth_sensor.preset) == ("davis346", "realsense")
+    assert job_of(json.loads(json.dumps(asdict(jobs[5])))) == jobs[5]
+
+
 @pytest.mark.slow
 def test_drift_is_the_distance_from_the_truth_with_both_at_the_same_start(
     one_by_one: tuple[Job, Path, Outcome], tmp_path: Path

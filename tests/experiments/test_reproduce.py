@@ -27,7 +27,7 @@ from edslam_ti.experiments.ablations import (
     ablation_rows,
     ablation_variants,
 )
-from edslam_ti.experiments.cases import Case, Recording, all_cases, quick_cases
+from edslam_ti.experiments.cases import Case, Recording, all_cases, quick_cases, with_sensors
 from edslam_ti.experiments.long_stream import FrameCost, held_bytes, measure, table, windows
 from edslam_ti.experiments.recordings import Recordings
 from edslam_ti.experiments.report import insert_into, markdown, write_report
@@ -173,6 +173,18 @@ def test_cases_are_unique_and_share_recordings() -> None:
     assert changes == len(set(first)) - 1  # each recording is opened once
     assert "office0-loop-30s-kinect-20hz-seed1" in names
     assert len(quick_cases()) == 4
+
+
+def test_other_sensors_record_the_same_cases() -> None:
+    cases = with_sensors(quick_cases(), "typical", "exact")
+    assert cases[0].name == "office0-typical-kinect-20hz-seed0"
+    assert len(cases) == 4
+    assert cases[0].recording.settings.sensor.preset == "typical"
+    cases = with_sensors(all_cases(), "davis346", "kinect_azure")
+    names = [case.name for case in cases]
+    assert len(set(names)) == len(names)
+    assert "room0-x2-davis346-kinect_azure-30hz-seed1" in names
+    assert [case.recording.sensor for case in cases if case.recording.scene == "slider_depth"] == ["ideal"]
 
 
 def test_selection_filters_and_combines() -> None:

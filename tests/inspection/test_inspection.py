@@ -4,12 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sequences import ate_cm, record_tiny_room, settings, tracked
 from spoiled import FAULTY, spoiled
 
 from edslam_ti.commands.inspect import FAULTY as FAULTY_EXIT
 from edslam_ti.commands.inspect import main
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence
+from edslam_ti.datasets.base import SampledSequence
+from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import DataError
 from edslam_ti.inspection.calibration import ShiftedDepth, calibrate_depth
 from edslam_ti.inspection.clock_offsets import Offset, clock_findings
@@ -84,6 +87,28 @@ def test_a_delay_of_depth_is_found(tiny_sequence: EventDepthSequence) -> None:
     assert found.delay == pytest.approx(0.02, abs=0.008)
     assert found.after < 0.5 * found.before
     assert "late and perhaps turned (too few frames to tell)" in found.text
+
+
+def test_depth_at_its_own_stamps_tracks_as_depth_in_step_and_an_offset_is_found(
+    tiny_sequence: EventDepthSequence, tmp_path: Path
+) -> None:
+    errors = {"in step": _tracking_error(tiny_sequence)}
+    for name, offset in (("out of step", 0.0), ("early", -0.01)):
+        own = {"rate": 30.0, "phase": 0.017, "time_offset": offset}
+        folder = record_tiny_room(tmp_path / name, max_motion=4.0, pose_rate=200.0, depth_sensor=own)
+        sequence = EventReplicaSequence(folder)
+        samples = SampledSequence(sequence, 0, None, 0.05)
+        stamps = sequence.depth_timestamps[1:]  # the first has no events before it
+        np.testing.assert_array_equal(samples.timestamps[samples.has_depth], stamps)
+        errors[name] = _tracking_error(sequence)
+    assert errors["out of step"] < 1.5 * errors["in step"] < 0.1  # cm; 0.040 and 0.036 were measured
+    assert errors["early"] > 1.2 * errors["out of step"]  # 10 ms are seen in the path
+    found = calibrate_depth(sequence, settings(), lambda what: None)
+    assert found.delay == pytest.approx(-0.01, abs=0.004)
+
+
+def _tracking_error(sequence: EventDepthSequence) -> float:  # cm
+    return ate_cm(tracked(sequence, list(SampledSequence(sequence, 0, None, 0.05))), sequence)
 
 
 def test_what_cannot_be_calibrated_is_said(tiny_sequence: EventDepthSequence) -> None:
