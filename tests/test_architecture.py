@@ -92,7 +92,19 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
-        *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
+        *(
+            "run",
+            "trust",
+            "run_folder",
+            "reading",
+            "export",
+            "maps",
+            "pictures",
+            "page",
+            "plots",
+            "window",
+            "views",
+        ),
         *("metrics", "folder"),
     ],
     "experiments": [

@@ -21,6 +21,7 @@ from edslam_ti.output import atomic_file
 from edslam_ti.patient_console import say
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_of
+from edslam_ti.results.page import write_page
 from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
 from edslam_ti.results.run import Run
@@ -87,6 +88,9 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
                 run.note_once(line)
             run.note("seconds per frame: " + _listed(numbers["seconds_per_frame"]))
             metrics = numbers
+            span = slam.trajectory.timestamps[-1] - slam.trajectory.timestamps[0]
+            missing = [*parts.left_out, *run.left_out]
+            parts.add("page", lambda: write_page(folder, numbers, float(span), missing))
         run.note("saved" if parts.error is None else f"not all could be saved: {parts.error}")
         parts.write("log", lambda: _write_log(run, folder))
     for line in (*parts.left_out, *run.left_out):
