@@ -92,20 +92,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
-        *(
-            "run",
-            "trust",
-            "run_folder",
-            "reading",
-            "export",
-            "maps",
-            "pictures",
-            "page",
-            "plots",
-            "window",
-            "views",
-        ),
-        *("metrics", "folder"),
+        *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "page", "plots", "window"),
+        *("views", "splat_file", "gltf", "camera_paths", "other_formats", "metrics", "folder"),
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),

@@ -24,6 +24,7 @@ from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_
 from edslam_ti.results.page import write_page
 from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
+from edslam_ti.results.reading import write_camera
 from edslam_ti.results.run import Run
 from edslam_ti.results.trust import Trust
 from edslam_ti.results.views import KINDS, ViewNumbers, save_views
@@ -57,6 +58,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
         }
         for name, path in paths.items():
             parts.write("trajectory", partial(write_tum, path, folder / name, offset))
+        parts.write("camera", lambda: write_camera(folder, run.sequence.camera))
         has_map = mapper is not None and parts.write("map", lambda: _save_map(run, folder)) is True
         parts.write("log", lambda: _write_log(run, folder))
         truth = parts.add("truth", run.true_trajectory)

@@ -33,6 +33,7 @@ FILES = {  # what is said of a file, in the order of the page
     "flythrough.mp4": "render and depth along the smoothed path",
     "renders/views.csv": "the numbers of every rendered view",
     "metrics.json": "every number, with its unit in its name",
+    "camera.json": "the camera: size and pinhole intrinsics in pixels, centres at integers",
     "config.yaml": "all settings",
     "log.txt": "lost frames and other events",
 }
