@@ -56,7 +56,7 @@ ORDERS: dict[str, list[str]] = {
             "conversion",
         ),
         "evaluation",
-        *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
+        *("slam", "viewer", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
         "command_line",
     ],
     "event_images": ["change", "noisy", "sums", "solve", "contrast", "sharp"],
@@ -120,7 +120,7 @@ LIBRARIES: dict[str, list[str]] = {
     "yaml": ["config", "datasets"],
     "scipy": [
         *("datasets", "trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"),
-        "inspection",
+        *("inspection", "viewer"),
     ],
     "cv2": [
         *(
@@ -137,7 +137,7 @@ LIBRARIES: dict[str, list[str]] = {
             "tracking",
             "mapping",
         ),
-        "results",
+        *("results", "viewer"),
     ],
     "OpenEXR": ["datasets"],
     "platformdirs": ["cache"],
@@ -156,6 +156,7 @@ LIBRARIES: dict[str, list[str]] = {
     "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
     "ray": ["experiments.scheduler"],
+    "viser": ["viewer.server"],
 }
 USES_OPEN3D = [
     "mesh_reading",
@@ -183,6 +184,7 @@ HEAVY = {
     "hdf5plugin",
     "aedat",
     "ray",
+    "viser",
 }
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more

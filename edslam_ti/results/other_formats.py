@@ -16,6 +16,7 @@ from edslam_ti.results.gltf import write_glb
 from edslam_ti.results.maps import load_map
 from edslam_ti.results.reading import Result, load_result, read_camera_of
 from edslam_ti.results.splat_file import write_splat
+from edslam_ti.viewer.shapes import up_direction
 
 MOST_POINTS = 100_000  # in points3D.txt: programs start from them
 BACKGROUND = 0.5  # brightness where a rendered image shows nothing
@@ -104,18 +105,6 @@ def export_all(exporter: Exporter) -> Iterator[tuple[list[Path], str]]:
             yield write(exporter), ""
         except (DataError, FileNotFoundError) as error:
             yield [], f"left out: {name}: {error}"
-
-
-def up_direction(poses: np.ndarray) -> np.ndarray:  # [F, 4, 4] -> [3]
-    """Return the mean of the cameras' up directions, or the axis that it is nearest to within 30 degrees."""
-    mean = -poses[:, :3, 1].mean(0)
-    if np.linalg.norm(mean) < 1e-6:
-        return np.array([0.0, 1, 0])
-    mean /= np.linalg.norm(mean)
-    k = int(np.abs(mean).argmax())
-    axis = np.zeros(3)
-    axis[k] = np.sign(mean[k])
-    return axis if abs(mean[k]) > np.cos(np.deg2rad(30)) else mean
 
 
 def _write_grey(path: Path, image: np.ndarray) -> None:  # [H, W] in [0, 1]

@@ -8,7 +8,8 @@ from edslam_ti.camera import Camera
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.results.plots import colours
 from edslam_ti.results.reading import load_result
-from edslam_ti.viewer import check_display, fill_cloud, fill_lines, frustum_lines, path_lines
+from edslam_ti.viewer.shapes import frustum_lines, path_lines
+from edslam_ti.viewer.window import check_display, fill_cloud, fill_lines
 
 
 def show_results(results: Sequence[Path]) -> None:

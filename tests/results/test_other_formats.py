@@ -17,7 +17,7 @@ from edslam_ti.geometry import inverse
 from edslam_ti.mapping.gaussian_ply import write_gaussian_ply
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.results.gltf import linear_of_srgb, write_glb
-from edslam_ti.results.other_formats import FORMATS, Exporter, up_direction
+from edslam_ti.results.other_formats import FORMATS, Exporter
 from edslam_ti.results.reading import read_camera_of, write_camera
 
 POINT = np.array([0.3, -0.2, 1.5])  # metres, in view of every pose of `curve`
@@ -175,11 +175,3 @@ def test_mesh_without_faces_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected a mesh"):
         write_glb(tmp_path / "a.glb", np.zeros((3, 3)), np.empty((0, 3)), np.zeros((3, 3)))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_up_is_where_the_cameras_are_upright() -> None:
-    poses = curve().poses
-    np.testing.assert_allclose(up_direction(poses), [0, -1, 0])
-    tilted = poses.copy()
-    tilted[:, :3, 1] = [0, -1, 1]
-    np.testing.assert_allclose(up_direction(tilted), np.array([0, 1, -1]) / np.sqrt(2), atol=1e-9)
