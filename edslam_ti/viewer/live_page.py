@@ -9,7 +9,7 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.errors import plain
 from edslam_ti.viewer.moment import Moment
-from edslam_ti.viewer.server import add_screenshot_button, look_through, place_eye
+from edslam_ti.viewer.server import add_screenshot_button, look_through, place_eye, set_up
 from edslam_ti.viewer.shapes import (
     KEYFRAME_COLOUR,
     PATH_COLOUR,
@@ -141,6 +141,8 @@ class LivePage:
         """Send an update to the pages."""
         poses = update.poses
         if len(poses) > 1.2 * self._opened_with:
+            if self._opened_with == 0:
+                set_up(self._server, poses)
             place_eye(self._server, poses, update.camera.height / 2 / update.camera.fy)
             self._opened_with = len(poses)
         for block in update.blocks:
@@ -168,7 +170,8 @@ class LivePage:
 
     def _lines(self, name: str, lines: list[np.ndarray], color: str, width: float) -> None:
         segments = np.asarray(lines, np.float32)
-        colors = np.broadcast_to(np.array(rgb(color), np.uint8), segments.shape)
+        linear = 255 * (np.array(rgb(color)) / 255) ** 2.2  # as pages take the colours of lines
+        colors = np.broadcast_to(linear.astype(np.uint8), segments.shape)
         self._server.scene.add_line_segments(
             name, segments, colors, thickness=width, thickness_units="screen"
         )

@@ -79,10 +79,14 @@ def _check_address(address: str) -> None:
 # --- eyes ---
 
 
+def set_up(server: Any, poses: np.ndarray) -> None:  # [F, 4, 4]
+    """Tell pages which way is up; their eyes turn about it."""
+    server.scene.set_up_direction(tuple(up_direction(poses)))
+
+
 def place_eye(server: Any, poses: np.ndarray, half_height: float = HALF_HEIGHT) -> None:  # [F, 4, 4]
     """Let new pages open where the first camera stood, with the whole path in sight."""
     view = opening_view(poses, half_height, ASPECT * half_height)
-    server.scene.set_up_direction(tuple(up_direction(poses)))
     eye = server.initial_camera
     eye.position = tuple(view[:3, 3])
     eye.look_at = tuple(view[:3, 3] + view[:3, 2])

@@ -33,8 +33,35 @@ class Splats:
 
     def draw(self, scene: Any, name: str, **node: Any) -> Any:
         """Add them to viser's scene; return the handle."""
-        rest = (self.covariances(), np.clip(self.colors, 0, 1), self.opacities[:, None])
-        return scene.add_gaussian_splats(name, self.means, *rest, **node)
+        return scene.add_gaussian_splats(name, *self._arrays(), **node)
+
+    def send(self, handle: Any) -> None:
+        """Replace what a handle shows."""
+        handle.set_gaussians(*self._arrays())
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return self.means, self.covariances(), np.clip(self.colors, 0, 1), self.opacities[:, None]
+
+    def padded(self, count: int) -> "Splats":
+        """Return `count` splats: these, then some that cannot be seen."""
+        missing = count - len(self.means)
+        if missing <= 0:
+            return self
+        point = self.means[:1] if len(self.means) else np.zeros((1, 3), np.float32)
+        return Splats(
+            np.concatenate([self.means, np.repeat(point, missing, axis=0)]),
+            np.concatenate([self.quats, np.tile(np.float32([1, 0, 0, 0]), (missing, 1))]),
+            np.concatenate([self.scales, np.full((missing, 3), 1e-4, np.float32)]),
+            np.concatenate([self.opacities, np.zeros(missing, np.float32)]),
+            np.concatenate([self.colors, np.zeros((missing, 3), np.float32)]),
+        )
+
+
+NOTHING = Splats(
+    *(np.empty((0, width), np.float32) for width in (3, 4, 3)),
+    np.empty(0, np.float32),
+    np.empty((0, 3), np.float32),
+)
 
 
 @dataclass(frozen=True)
@@ -42,23 +69,37 @@ class Block:
     """A part of the map, copied from it."""
 
     index: int
+    num_blocks: int  # of the map
     splats: Splats
 
 
+def splats_of(gaussians: GaussianMap, chosen: torch.Tensor, size: float = 1.0) -> Splats:  # [M] indices
+    """Copy Gaussians from a map, `size` times as large."""
+    with torch.no_grad():
+        part = gaussians.activated(chosen)
+    return Splats(
+        part.means.detach().numpy(),
+        part.quats.detach().numpy(),
+        np.float32(size) * part.scales.detach().numpy(),
+        part.opacities.detach().numpy(),
+        np.repeat(part.colors.detach().numpy(), 3, axis=1),
+    )
+
+
 class SplatStream:
-    """Which blocks of a growing and changing map a page gets next."""
+    """Which blocks of a growing and changing map a page gets next.
+
+    A page sorts all splats again whenever their number changes, and shows none until it has. So blocks are
+    padded with splats that cannot be seen, and there are 1, 2, 4 or 8 of them.
+    """
 
     def __init__(self, scene: Any, name: str = "/map") -> None:
         self._scene = scene
         self._name = name
-        self._shown: dict[int, Any] = {}  # handles by block
+        self._shown: list[Any] = []  # handles
         self._sizes: dict[int, int] = {}  # splats of a block when it was copied
         self._next = 0
         self.num_blocks = 0  # of the map, when a block was last chosen
-
-    def forget(self) -> None:
-        """Send everything again."""
-        self._sizes.clear()
 
     def copied(self, gaussians: GaussianMap) -> Block | None:
         """Copy the block that is due from the map; None: it is empty. Takes a few milliseconds."""
@@ -71,37 +112,23 @@ class SplatStream:
         index = self._due([len(part) for part in everyone.split(BLOCK)])
         chosen = everyone[index * BLOCK : (index + 1) * BLOCK]
         self._sizes[index] = len(chosen)
-        with torch.no_grad():
-            part = gaussians.activated(chosen)
-        size = np.float32(step**0.5)  # fewer splats cover the same surface
-        return Block(
-            index,
-            Splats(
-                part.means.detach().numpy(),
-                part.quats.detach().numpy(),
-                size * part.scales.detach().numpy(),
-                part.opacities.detach().numpy(),
-                np.repeat(part.colors.detach().numpy(), 3, axis=1),
-            ),
-        )
+        size = step**0.5  # fewer splats cover the same surface
+        return Block(index, self.num_blocks, splats_of(gaussians, chosen, size).padded(BLOCK))
 
     def _due(self, sizes: list[int]) -> int:
-        """Return the first block that has not been sent or has grown, else the one sent longest ago."""
+        """Return the first block that has not been sent or has changed its size, else the oldest."""
         for k, size in enumerate(sizes):
-            if self._sizes.get(k, 0) < size:
+            if self._sizes.get(k, 0) != size:
                 return k
         self._next = (self._next + 1) % len(sizes)
         return self._next
 
     def send(self, block: Block) -> None:
-        """Send a block to the pages, and take away those that the map has no more."""
-        handle = self._shown.get(block.index)
-        splats = block.splats
-        if handle is None:
-            self._shown[block.index] = splats.draw(self._scene, f"{self._name}/{block.index}")
-        else:
-            colors, opacities = np.clip(splats.colors, 0, 1), splats.opacities[:, None]
-            handle.set_gaussians(splats.means, splats.covariances(), colors, opacities)
-        for index in [k for k in self._shown if k >= max(self.num_blocks, 1)]:
-            self._shown.pop(index).remove()
-            self._sizes.pop(index, None)
+        """Send a block to the pages."""
+        needed = 1 << (block.num_blocks - 1).bit_length()
+        while len(self._shown) < needed:
+            name = f"{self._name}/{len(self._shown)}"
+            self._shown.append(NOTHING.padded(BLOCK).draw(self._scene, name))
+        for k, handle in enumerate(self._shown):
+            handle.visible = k < block.num_blocks
+        block.splats.send(self._shown[block.index])
