@@ -87,7 +87,7 @@ class BrowserViewer:
             text=self._page.status(moment),
         )
         if moment.truth is not None and not self._has_truth:
-            update.truth = moment.truth.poses[:, :3, 3].copy()
+            update.truth = moment.truth.poses.copy()
             self._has_truth = True
         self._copy_pictures(moment, update)
         self._copy_map(moment, update)

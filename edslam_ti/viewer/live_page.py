@@ -36,7 +36,7 @@ class Update:
     keyframes: list[int]
     curves: dict[str, np.ndarray]  # [N] by name
     text: str
-    truth: np.ndarray | None = None  # [N, 3] the true path
+    truth: np.ndarray | None = None  # [N, 4, 4] the true path
     pictures: dict[str, np.ndarray] = field(default_factory=dict)  # [H, W, 3] uint8, by name
     blocks: list[Block] = field(default_factory=list)
     points: tuple[np.ndarray, np.ndarray] | None = None  # [N, 3] metres, [N] brightness
@@ -50,6 +50,7 @@ class LivePage:
         self._curves: dict[str, list[float]] = {name: [] for name in ("frame", *CURVES)}
         self._every, self._num_notes = 1, 0  # every n-th value is kept
         self._opened_with = 0  # poses when the opening view was set
+        self._whole_path = np.empty((0, 4, 4))  # known before the run is through
         self._lock = threading.Lock()
         self._is_paused, self._steps = False, 0
         gui = server.gui
@@ -140,11 +141,7 @@ class LivePage:
     def show(self, update: Update) -> None:
         """Send an update to the pages."""
         poses = update.poses
-        if len(poses) > 1.2 * self._opened_with:
-            if self._opened_with == 0:
-                set_up(self._server, poses)
-            place_eye(self._server, poses, update.camera.height / 2 / update.camera.fy)
-            self._opened_with = len(poses)
+        self._place_eye(update)
         for block in update.blocks:
             self._stream.send(block)
         if update.points is not None:
@@ -152,7 +149,7 @@ class LivePage:
             colors = np.repeat(np.clip(brightness, 0, 1)[:, None], 3, axis=1)
             self._server.scene.add_point_cloud("/points", points, colors, point_size=0.01)
         if update.truth is not None and len(update.truth) > 1:
-            self._lines("/truth", path_lines(update.truth), TRUTH_COLOUR, 1.5)
+            self._lines("/truth", path_lines(update.truth[:, :3, 3]), TRUTH_COLOUR, 1.5)
         if len(poses) > 1:
             self._lines("/path", path_lines(poses[:, :3, 3]), PATH_COLOUR, 3.0)
         keyframes = [poses[k] for k in update.keyframes if k < len(poses)]
@@ -167,6 +164,17 @@ class LivePage:
         if self._follow.value:
             for client in self._server.get_clients().values():
                 look_through(client, poses[-1])
+
+    def _place_eye(self, update: Update) -> None:
+        """Let new pages open with the whole path in sight; of the true one where that is known."""
+        if update.truth is not None:
+            self._whole_path = update.truth
+        if len(update.poses) > 1.2 * self._opened_with:
+            if self._opened_with == 0:
+                set_up(self._server, update.poses)
+            self._opened_with = len(update.poses)
+            path = np.concatenate([update.poses, self._whole_path])
+            place_eye(self._server, path, update.camera.height / 2 / update.camera.fy)
 
     def _lines(self, name: str, lines: list[np.ndarray], color: str, width: float) -> None:
         segments = np.asarray(lines, np.float32)

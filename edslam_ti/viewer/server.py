@@ -28,6 +28,11 @@ def open_server(address: str, port: int, say: Say) -> Any:  # viser.ViserServer
         def request_share_url(self, verbose: bool = True) -> None:
             """Open no tunnel, whoever asks."""
 
+        def stop(self) -> None:
+            """Stop without a word."""
+            with contextlib.redirect_stdout(io.StringIO()):
+                super().stop()
+
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         server = Server(host=address, port=port, label="ED-SLAM", verbose=False)
     server.gui.configure_theme(

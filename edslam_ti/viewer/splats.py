@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from edslam_ti.mapping.gaussians import GaussianMap
 
 BLOCK = 16_384  # splats
-MOST_BLOCKS = 8  # beyond, only every n-th Gaussian is shown, and drawn larger
+MOST_BLOCKS = 16  # beyond, only some of the Gaussians are shown, and drawn larger
+SCATTERED = 2654435761  # times an index, modulo 2^32: any part of the range holds the same share (Knuth)
 
 
 @dataclass(frozen=True)
@@ -50,18 +51,15 @@ class Splats:
         point = self.means[:1] if len(self.means) else np.zeros((1, 3), np.float32)
         return Splats(
             np.concatenate([self.means, np.repeat(point, missing, axis=0)]),
-            np.concatenate([self.quats, np.tile(np.float32([1, 0, 0, 0]), (missing, 1))]),
+            np.concatenate([self.quats, np.tile(np.array([1, 0, 0, 0], np.float32), (missing, 1))]),
             np.concatenate([self.scales, np.full((missing, 3), 1e-4, np.float32)]),
             np.concatenate([self.opacities, np.zeros(missing, np.float32)]),
             np.concatenate([self.colors, np.zeros((missing, 3), np.float32)]),
         )
 
 
-NOTHING = Splats(
-    *(np.empty((0, width), np.float32) for width in (3, 4, 3)),
-    np.empty(0, np.float32),
-    np.empty((0, 3), np.float32),
-)
+_EMPTY = np.empty((0, 3), np.float32)
+NOTHING = Splats(_EMPTY, np.empty((0, 4), np.float32), _EMPTY, np.empty(0, np.float32), _EMPTY)
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class SplatStream:
     """Which blocks of a growing and changing map a page gets next.
 
     A page sorts all splats again whenever their number changes, and shows none until it has. So blocks are
-    padded with splats that cannot be seen, and there are 1, 2, 4 or 8 of them.
+    padded with splats that cannot be seen, and their number is a power of two.
     """
 
     def __init__(self, scene: Any, name: str = "/map") -> None:
@@ -103,9 +101,10 @@ class SplatStream:
 
     def copied(self, gaussians: GaussianMap) -> Block | None:
         """Copy the block that is due from the map; None: it is empty. Takes a few milliseconds."""
-        count = len(gaussians)
-        step = max(1, -(-count // (MOST_BLOCKS * BLOCK)))
-        everyone = torch.arange(0, count, step)
+        step = max(1.0, len(gaussians) / (MOST_BLOCKS * BLOCK))
+        everyone = torch.arange(len(gaussians))
+        if step > 1:
+            everyone = everyone[everyone * SCATTERED % 2**32 < 2**32 / step][: MOST_BLOCKS * BLOCK]
         self.num_blocks = -(-len(everyone) // BLOCK)
         if self.num_blocks == 0:
             return None
