@@ -93,7 +93,8 @@ ORDERS: dict[str, list[str]] = {
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "page", "plots", "window"),
-        *("views", "splat_file", "gltf", "camera_paths", "other_formats", "metrics", "folder"),
+        *("views", "splat_file", "gltf", "camera_paths", "other_formats", "shown_run", "browse"),
+        *("metrics", "folder"),
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
@@ -109,7 +110,7 @@ LIBRARIES: dict[str, list[str]] = {
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
     "pydantic": [
-        "experiments.paper_options",
+        *("experiments.paper_options", "commands"),
         *("stage", "rgbd_config", "config"),
         "arguments",
         "checkpoint",
@@ -157,6 +158,7 @@ LIBRARIES: dict[str, list[str]] = {
     "psutil": ["experiments.long_stream"],
     "ray": ["experiments.scheduler"],
     "viser": ["viewer.server"],
+    "trimesh": ["results.shown_run"],
 }
 USES_OPEN3D = [
     "mesh_reading",
@@ -185,6 +187,7 @@ HEAVY = {
     "aedat",
     "ray",
     "viser",
+    "trimesh",
 }
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more

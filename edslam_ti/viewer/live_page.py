@@ -9,14 +9,13 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.errors import plain
 from edslam_ti.viewer.moment import Moment
-from edslam_ti.viewer.server import add_screenshot_button, look_through, place_eye, set_up
+from edslam_ti.viewer.server import add_lines, add_screenshot_button, look_through, place_eye, set_up
 from edslam_ti.viewer.shapes import (
     KEYFRAME_COLOUR,
     PATH_COLOUR,
     TRUTH_COLOUR,
     frustum_lines,
     path_lines,
-    rgb,
 )
 from edslam_ti.viewer.splats import Block, SplatStream
 
@@ -60,7 +59,7 @@ class LivePage:
         self._follow = gui.add_checkbox("Follow camera", False)
         self._pause.on_click(lambda event: self._set_paused(not self._is_paused))
         self._step.on_click(lambda event: self._make_step())
-        add_screenshot_button(server, viser)
+        add_screenshot_button(server)
         tabs = gui.add_tab_group()
         blank = np.full((60, 96, 3), 235, np.uint8)
         with tabs.add_tab("Images"):
@@ -149,14 +148,20 @@ class LivePage:
             colors = np.repeat(np.clip(brightness, 0, 1)[:, None], 3, axis=1)
             self._server.scene.add_point_cloud("/points", points, colors, point_size=0.01)
         if update.truth is not None and len(update.truth) > 1:
-            self._lines("/truth", path_lines(update.truth[:, :3, 3]), TRUTH_COLOUR, 1.5)
+            add_lines(self._server, "/truth", path_lines(update.truth[:, :3, 3]), TRUTH_COLOUR, 1.5)
         if len(poses) > 1:
-            self._lines("/path", path_lines(poses[:, :3, 3]), PATH_COLOUR, 3.0)
+            add_lines(self._server, "/path", path_lines(poses[:, :3, 3]), PATH_COLOUR, 3.0)
         keyframes = [poses[k] for k in update.keyframes if k < len(poses)]
         frusta = [line for T in keyframes for line in frustum_lines(T, update.camera, FRUSTUM)]
         if frusta:
-            self._lines("/keyframes", frusta, KEYFRAME_COLOUR, 1.5)
-        self._lines("/camera", frustum_lines(poses[-1], update.camera, NEWEST_FRUSTUM), NEWEST_COLOUR, 3.0)
+            add_lines(self._server, "/keyframes", frusta, KEYFRAME_COLOUR, 1.5)
+        add_lines(
+            self._server,
+            "/camera",
+            frustum_lines(poses[-1], update.camera, NEWEST_FRUSTUM),
+            NEWEST_COLOUR,
+            3.0,
+        )
         for name, picture in update.pictures.items():
             self._images[name].image = picture
         self._status.content = update.text
@@ -175,14 +180,6 @@ class LivePage:
             self._opened_with = len(update.poses)
             path = np.concatenate([update.poses, self._whole_path])
             place_eye(self._server, path, update.camera.height / 2 / update.camera.fy)
-
-    def _lines(self, name: str, lines: list[np.ndarray], color: str, width: float) -> None:
-        segments = np.asarray(lines, np.float32)
-        linear = 255 * (np.array(rgb(color)) / 255) ** 2.2  # as pages take the colours of lines
-        colors = np.broadcast_to(linear.astype(np.uint8), segments.shape)
-        self._server.scene.add_line_segments(
-            name, segments, colors, thickness=width, thickness_units="screen"
-        )
 
     def _draw_curves(self, curves: dict[str, np.ndarray]) -> None:
         for name, plot in self._plots.items():

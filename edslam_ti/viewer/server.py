@@ -4,6 +4,7 @@ import contextlib
 import io
 import ipaddress
 import socket
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from edslam_ti.errors import EdSlamError, MissingExtraError
 from edslam_ti.viewer.moment import Say
-from edslam_ti.viewer.shapes import opening_view, up_direction
+from edslam_ti.viewer.shapes import opening_view, rgb, up_direction
 
 ASPECT = 1.6  # width over height of a usual browser's page
 HALF_HEIGHT = 0.6  # tangent of half the angle of view where the camera is not known
@@ -100,9 +101,11 @@ def place_eye(server: Any, poses: np.ndarray, half_height: float = HALF_HEIGHT) 
     eye.near = 0.02
 
 
-def look_through(client: Any, T_world_camera: np.ndarray) -> None:  # [4, 4]
-    """Move a page's eye to a camera."""
+def look_through(client: Any, T_world_camera: np.ndarray, angle: float | None = None) -> None:
+    """Move a page's eye to a camera with some vertical angle of view (radians)."""
     with client.atomic():
+        if angle is not None:
+            client.camera.fov = angle
         client.camera.position = T_world_camera[:3, 3]
         client.camera.wxyz = wxyz_of(T_world_camera)
 
@@ -115,9 +118,17 @@ def wxyz_of(T_world_camera: np.ndarray) -> np.ndarray:  # [4, 4] -> [4]
 # --- what both pages have ---
 
 
-def add_screenshot_button(server: Any, viser: Any) -> None:
+def add_lines(server: Any, name: str, lines: Sequence[np.ndarray], color: str, width: float) -> Any:
+    """Show lines [2, 3] of one colour, #rrggbb, some pixels wide, in place of those of the same name."""
+    segments = np.asarray(lines, np.float32)
+    linear = 255 * (np.array(rgb(color)) / 255) ** 2.2  # as pages take the colours of lines
+    colors = np.broadcast_to(linear.astype(np.uint8), segments.shape)
+    return server.scene.add_line_segments(name, segments, colors, thickness=width, thickness_units="screen")
+
+
+def add_screenshot_button(server: Any) -> None:
     """Add a button that saves what a page shows as a picture, at its reader's computer."""
-    button = server.gui.add_button("Screenshot", icon=viser.Icon.CAMERA)
+    button = server.gui.add_button("Screenshot")
 
     @button.on_click
     def _(event: Any) -> None:
