@@ -13,11 +13,11 @@ from edslam_ti.mapping.gaussian_ply import read_gaussian_ply
 from edslam_ti.results.pictures import read_panels
 from edslam_ti.results.reading import Result, load_result, read_camera_of
 from edslam_ti.trajectory import Trajectory
-from edslam_ti.viewer.splats import SCATTERED, Splats
+from edslam_ti.viewer.splats import SCATTERED, Splats, pixel_sigmas
 
 KINDS = ("splats", "mesh", "points")
 MOST_SHOWN = 400_000  # splats or points
-UNKNOWN_CAMERA = Camera(width=4, height=3, fx=3.0, fy=3.0, cx=1.5, cy=1.0)
+UNKNOWN_CAMERA = Camera(width=400, height=300, fx=300.0, fy=300.0, cx=199.5, cy=149.5)
 HIT_ANGLE = 0.01  # radians from the ray of a click within which points are hit
 HIT_DEPTH = 0.03  # share of the distance by which points count as one surface
 
@@ -111,7 +111,8 @@ class ShownRun:
         """Add splats, mesh or points to a page's scene; return the handle."""
         result = self.result
         if kind == "splats" and self.splats is not None:
-            return self.splats.draw(scene, name)
+            sigmas = pixel_sigmas(self.splats.means, self.trajectory.poses, self.camera)
+            return self.splats.widened(sigmas).draw(scene, name)
         if kind == "points" and result.points is not None and result.brightness is not None:
             chosen = _thinned(len(result.points))
             grey = np.repeat(np.clip(result.brightness[chosen, None], 0, 1), 3, axis=1)

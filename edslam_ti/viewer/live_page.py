@@ -142,7 +142,7 @@ class LivePage:
         poses = update.poses
         self._place_eye(update)
         for block in update.blocks:
-            self._stream.send(block)
+            self._stream.send(block, poses, update.camera)
         if update.points is not None:
             points, brightness = update.points
             colors = np.repeat(np.clip(brightness, 0, 1)[:, None], 3, axis=1)

@@ -37,8 +37,13 @@ def open_server(address: str, port: int, say: Say) -> Any:  # viser.ViserServer
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         server = Server(host=address, port=port, label="ED-SLAM", verbose=False)
     server.gui.configure_theme(
-        show_logo=False, show_share_button=False, control_width="large", brand_color=(0, 114, 178)
+        show_logo=False,
+        show_share_button=False,
+        control_layout="fixed",
+        control_width="medium",
+        brand_color=(0, 114, 178),
     )
+    server.gui.main_panel.dock_right()  # beside the scene, not over it
     if not is_local(address):
         say(
             f"warning: the page is open to other machines at {address}: whoever reaches it sees the run and "

@@ -7,10 +7,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from edslam_ti.camera import Camera
 from edslam_ti.mapping.gaussians import GaussianMap
 
 BLOCK = 16_384  # splats
 MOST_BLOCKS = 16  # beyond, only some of the Gaussians are shown, and drawn larger
+MOST_EYES = 8  # of the path, from which distances are measured
+PIXEL_SIGMA = 0.3**0.5  # pixels (Kerbl et al. 2023), as kernels/projection.py has it
 SCATTERED = 2654435761  # times an index, modulo 2^32: any part of the range holds the same share (Knuth)
 
 
@@ -31,6 +34,11 @@ class Splats:
         axes = Rotation.from_quat(self.quats, scalar_first=True).as_matrix().astype(np.float32)
         axes = axes * self.scales[:, None, :]
         return np.asarray(axes @ axes.transpose(0, 2, 1))
+
+    def widened(self, sigmas: np.ndarray) -> "Splats":  # [N] metres
+        """Return them blurred by isotropic Gaussians."""
+        scales = np.sqrt(self.scales**2 + sigmas.astype(np.float32)[:, None] ** 2)
+        return Splats(self.means, self.quats, scales, self.opacities, self.colors)
 
     def draw(self, scene: Any, name: str, **node: Any) -> Any:
         """Add them to viser's scene; return the handle."""
@@ -84,6 +92,21 @@ def splats_of(gaussians: GaussianMap, chosen: torch.Tensor, size: float = 1.0) -
     )
 
 
+def pixel_sigmas(
+    means: np.ndarray,  # [N, 3] metres, world
+    poses: np.ndarray,  # [F, 4, 4] T_world_camera
+    camera: Camera,
+) -> np.ndarray:  # [N] metres
+    """Return how wide the blur of the recording's pixels is at each splat, seen from the nearest camera.
+
+    Maps are made for images in which every splat is blurred by that much. A page has smaller pixels, and
+    would show holes between the splats.
+    """
+    eyes = poses[np.unique(np.linspace(0, len(poses) - 1, MOST_EYES).round().astype(int)), :3, 3]
+    distances = [np.linalg.norm(means - eye.astype(np.float32), axis=1) for eye in eyes]
+    return np.asarray(PIXEL_SIGMA / camera.fx * np.min(distances, axis=0))
+
+
 class SplatStream:
     """Which blocks of a growing and changing map a page gets next.
 
@@ -122,12 +145,13 @@ class SplatStream:
         self._next = (self._next + 1) % len(sizes)
         return self._next
 
-    def send(self, block: Block) -> None:
-        """Send a block to the pages."""
+    def send(self, block: Block, poses: np.ndarray, camera: Camera) -> None:
+        """Send a block to the pages; the path and its camera say from how near it was seen."""
         needed = 1 << (block.num_blocks - 1).bit_length()
         while len(self._shown) < needed:
             name = f"{self._name}/{len(self._shown)}"
             self._shown.append(NOTHING.padded(BLOCK).draw(self._scene, name))
         for k, handle in enumerate(self._shown):
             handle.visible = k < block.num_blocks
-        block.splats.send(self._shown[block.index])
+        sigmas = pixel_sigmas(block.splats.means, poses, camera)
+        block.splats.widened(sigmas).send(self._shown[block.index])
