@@ -158,6 +158,7 @@ LIBRARIES: dict[str, list[str]] = {
     "psutil": ["experiments.long_stream"],
     "ray": ["experiments.scheduler"],
     "viser": ["viewer.server"],
+    "rerun": ["viewer.rerun_log"],
     "trimesh": ["results.shown_run"],
 }
 USES_OPEN3D = [
@@ -187,6 +188,7 @@ HEAVY = {
     "aedat",
     "ray",
     "viser",
+    "rerun",
     "trimesh",
 }
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}

@@ -6,13 +6,20 @@ from edslam_ti.config import Config
 from edslam_ti.errors import plain
 from edslam_ti.viewer.live import BrowserViewer
 from edslam_ti.viewer.moment import Moment, Say, Viewer
+from edslam_ti.viewer.rerun_log import RerunLog
 from edslam_ti.viewer.window import Open3dViewer
 
 # By the setting that asks for it; a viewer is made when a run starts and may raise EdSlamError.
 VIEWERS: dict[str, Callable[[Config, Say], Viewer]] = {
     "visualize": lambda config, say: Open3dViewer(),
     "viewer": lambda config, say: BrowserViewer(config.viewer_address, config.viewer_port, say),
+    "log": lambda config, say: _log(config),
 }
+
+
+def _log(config: Config) -> RerunLog:
+    assert config.log is not None  # the setting asks for it
+    return RerunLog(config.log)
 
 
 def make_viewers(config: Config, say: Say) -> "Viewers":

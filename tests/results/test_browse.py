@@ -15,7 +15,7 @@ from edslam_ti.results import browse
 from edslam_ti.results.browse import FinishedPage
 from edslam_ti.results.pictures import PictureRow, write_contact_sheet
 from edslam_ti.results.reading import write_camera
-from edslam_ti.results.shown_run import KINDS, ShownRun, first_hit
+from edslam_ti.results.shown_run import ShownRun, first_hit
 from edslam_ti.viewer.server import open_server, wxyz_of
 
 pytest.importorskip("viser", reason="viser (extra viewer) is not installed")
