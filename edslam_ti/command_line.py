@@ -24,7 +24,8 @@ from edslam_ti.methods import METHODS
 
 # Exit codes. A command that a signal has ended adds the signal's number to SIGNALLED, as the shell does:
 # 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
-WITH_RESUME = ("checkpoint", "visualize")  # settings that change no result
+# Settings that change no result
+WITH_RESUME = ("checkpoint", "visualize", "viewer", "viewer_address", "viewer_port", "log")
 FAILED, USAGE, LOST, SIGNALLED = 1, 2, 3, 128
 
 

@@ -337,6 +337,14 @@ class Config(Stage):
     Less often where they would take more than 2 % of the time."""
     visualize: bool = False
     """Show the run in an Open3D window."""
+    viewer: bool = False
+    """Show the run on a page for the browser (extra `viewer`)."""
+    viewer_address: str = Field("127.0.0.1", min_length=1)
+    """Address of the page. With any other one, other machines can see the run and pause it."""
+    viewer_port: int = Field(8080, ge=0, le=65535)
+    """Port of the page; the next free one is taken where it is in use; 0: any."""
+    log: Path | None = None
+    """Write the run into a file for the viewer of Rerun (extra `rerun`)."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of the kernels. A run refuses cuda, because rendering and tracking are not right there yet; the
     kernels alone and the benchmark can use it."""

@@ -17,7 +17,8 @@ from edslam_ti.datasets import find_sequence
 from edslam_ti.errors import DataError
 from edslam_ti.kernels import engine
 
-HARMLESS = {"checkpoint", "visualize", "out"}  # settings that change no result
+# Settings that change no result
+HARMLESS = {"checkpoint", "visualize", "viewer", "viewer_address", "viewer_port", "log", "out"}
 HASHED = 1 << 20  # bytes at either end of a large file
 SHARED = ("*.yaml", "*.json", "*calib*/*.yaml", "*calib*/*.txt")  # in the folder above
 TEXT = {".json", ".txt", ".yaml", ".yml", ".csv"}

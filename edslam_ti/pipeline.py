@@ -19,7 +19,7 @@ from rich.text import Text
 from edslam_ti import kernels
 from edslam_ti.checkpoint import Keeper
 from edslam_ti.config import Config
-from edslam_ti.datasets import EventDepthSequence, SampledSequence, find_sequence, open_sequence
+from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence, find_sequence, open_sequence
 from edslam_ti.errors import DataError, EdSlamError, plain
 from edslam_ti.evaluation.lpips import load_lpips
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
@@ -40,7 +40,7 @@ from edslam_ti.results.run_folder import FAILED, INTERRUPTED, RUNNING, SETTINGS,
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import Tracker, TruePoses
 from edslam_ti.truth import true_path
-from edslam_ti.viewer import VIEWERS, Viewer
+from edslam_ti.viewer import Moment, Viewer, make_viewers
 
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 Opener = Callable[[Config, Console], EventDepthSequence]
@@ -91,10 +91,10 @@ def run(config: Config, console: Console | None = None, open_with: Opener | None
 def resume(path: Path, config: Config, console: Console | None = None) -> Path:
     """Go on with a run that was cut off, in its folder, and return that.
 
-    `config` holds the settings of its config.yaml; only `checkpoint` and `visualize` may differ. Trajectory
-    and map come out as if the run had not been cut off: its last checkpoint is restored, and the frames since
-    then are processed again. Raises what `run` raises, and DataError where the run has finished, where
-    another process is at it, or where the recording or the program have changed.
+    `config` holds the settings of its config.yaml; only those that change no result, as `checkpoint` and
+    `viewer`, may differ. Trajectory and map come out as if the run had not been cut off: its last checkpoint
+    is restored, and the frames since then are processed again. Raises what `run` raises, and DataError where
+    the run has finished, where another process is at it, or where the recording or the program have changed.
     """
     console = console or patient_console()
     with signals_handled() as interruption:
@@ -136,7 +136,7 @@ def _prepare(config: Config, console: Console, open_with: Opener) -> tuple[Viewe
         kernels.init(config.device, threads=config.threads)
     except RuntimeError as error:  # no such device
         raise EdSlamError(str(error)) from error
-    viewer = VIEWERS["open3d" if config.visualize else "none"]()
+    viewer = make_viewers(config, lambda line: say(console, line))
     if config.mapping.enabled and config.evaluation.lpips_weights is not None:
         load_lpips(config.evaluation.lpips_weights)  # is it there, and what it should be?
     sequence = open_with(config, console)
@@ -309,7 +309,7 @@ def _process(state: Run, session: _Session) -> None:
     with progress_bar(session.console, TimeRemainingColumn()) as bar:
         first, total = len(slam.results), len(state.samples)
         task = bar.add_task("mapping" if mapper else "tracking", total=total, completed=first, status="")
-        ate = ""
+        ate, error = "", None
         for k in range(first, total):
             if session.interruption.requested:
                 break
@@ -343,7 +343,16 @@ def _process(state: Run, session: _Session) -> None:
                 status += f"  {mapper.num_gaussians} Gaussians  loss {mapper.loss:.3f}"
             bar.update(task, advance=1, status=status + ate)
             session.keeper.keep_if_due()
-            session.viewer.update(slam.trajectory, mapper, state.sequence.camera)
+            _show(state, session, sample, error)
+
+
+def _show(state: Run, session: _Session, sample: Sample | None, error_cm: float | None = None) -> None:
+    """Show how far the run is, and wait where somebody has paused it."""
+    sequence = state.sequence
+    num_frames = len(state.samples)
+    moment = Moment(state.slam, sequence.camera, sample, num_frames, sequence.truth, error_cm)
+    session.viewer.update(moment)
+    session.viewer.wait(lambda: session.interruption.requested)
 
 
 def _finish(state: Run, mapper: Mapper, session: _Session) -> None:
@@ -355,6 +364,7 @@ def _finish(state: Run, mapper: Mapper, session: _Session) -> None:
         def report(fraction: float) -> bool:
             bar.update(task, completed=int(100 * fraction), status=f"loss {mapper.loss:.3f}")
             session.journal.correct(state.slam.trajectory)
+            _show(state, session, None)
             if interruption.requested and not interruption.is_urgent:
                 session.keeper.keep()
             elif not interruption.requested:

@@ -76,7 +76,7 @@ ORDERS: dict[str, list[str]] = {
             "conversion",
         ),
         "evaluation",
-        *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
+        *("slam", "viewer", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
         "command_line",
     ],
     "event_images": [
@@ -114,8 +114,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
-        *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
-        "sensor",
+        *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "page", "plots", "window"),
+        *("views", "splat_file", "gltf", "camera_paths", "other_formats", "shown_run", "browse", "sensor"),
         *("metrics", "folder"),
     ],
     "experiments": [
@@ -133,7 +133,7 @@ LIBRARIES: dict[str, list[str]] = {
     "open3d": ["open3d_loader"],
     "libusb_package": ["open3d_loader"],
     "pydantic": [
-        "experiments.paper_options",
+        *("experiments.paper_options", "commands"),
         *("stage", "rgbd_config", "sensor_config", "config"),
         "arguments",
         "checkpoint",
@@ -144,7 +144,7 @@ LIBRARIES: dict[str, list[str]] = {
     "yaml": ["config", "datasets"],
     "scipy": [
         *("datasets", "trajectory", "truth", "journal", "simulation", "evaluation", "mapping", "results"),
-        "inspection",
+        *("inspection", "viewer"),
     ],
     "cv2": [
         *(
@@ -161,7 +161,7 @@ LIBRARIES: dict[str, list[str]] = {
             "tracking",
             "mapping",
         ),
-        "results",
+        *("results", "viewer"),
     ],
     "OpenEXR": ["datasets"],
     "platformdirs": ["cache"],
@@ -180,6 +180,9 @@ LIBRARIES: dict[str, list[str]] = {
     "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
     "psutil": ["experiments.long_stream"],
     "ray": ["experiments.scheduler"],
+    "viser": ["viewer.server"],
+    "rerun": ["viewer.rerun_log"],
+    "trimesh": ["results.shown_run"],
 }
 USES_OPEN3D = [
     "mesh_reading",
@@ -207,6 +210,9 @@ HEAVY = {
     "hdf5plugin",
     "aedat",
     "ray",
+    "viser",
+    "rerun",
+    "trimesh",
 }
 DRAWERS = {"utils", "util", "helpers", "helper", "common", "core", "misc", "main"}
 APP_LINES = 20  # a longer app is not thin any more

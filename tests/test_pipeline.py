@@ -45,6 +45,7 @@ ARTEFACTS = {
     *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "poses.csv", "trajectory.png"),
     *("map.ply", "mesh.ply", "points.ply", "flythrough.mp4"),
     *("config.yaml", "metrics.json", "log.txt", "renders", "journal.csv", "run.json"),
+    *("index.html", "camera.json"),
 }
 KEYS = {
     *("dataset", "scene", "method", "ate_rmse_cm", "ate_mean_cm", "ate_rmse_sim3_cm", "rpe_trans_cm"),

@@ -11,6 +11,7 @@ from edslam_ti.command_line import launch
 COMMANDS = {
     "slam": "track an event camera and build a 3D Gaussian map",
     "view": "show finished runs in a window, or draw them into a picture",
+    "export": "write a finished run for other programs: splats, glTF, KITTI, COLMAP, nerfstudio",
     "evaluate": "compare two trajectories, and a mesh with the true surfaces",
     "inspect": "check a recording: numbers, a picture, and what looks wrong in it",
     "convert": "write a recording in another layout, to the bit",

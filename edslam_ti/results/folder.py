@@ -22,8 +22,10 @@ from edslam_ti.output import atomic_file
 from edslam_ti.patient_console import say
 from edslam_ti.results.export import fuse_mesh, write_mesh, write_points
 from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_of
+from edslam_ti.results.page import write_page
 from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
+from edslam_ti.results.reading import write_camera
 from edslam_ti.results.run import Run
 from edslam_ti.results.sensor import plot_sensor, sensor_lines, sensor_metrics
 from edslam_ti.results.trust import Trust
@@ -58,6 +60,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
         }
         for name, path in paths.items():
             parts.write("trajectory", partial(write_tum, path, folder / name, offset))
+        parts.write("camera", lambda: write_camera(folder, run.sequence.camera))
         has_map = mapper is not None and parts.write("map", lambda: _save_map(run, folder)) is True
         parts.write("log", lambda: _write_log(run, folder))
         truth = parts.add("truth", run.true_trajectory)
@@ -91,6 +94,9 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
                 run.note_once(line)
             run.note("seconds per frame: " + _listed(numbers["seconds_per_frame"]))
             metrics = numbers
+            span = slam.trajectory.timestamps[-1] - slam.trajectory.timestamps[0]
+            missing = [*parts.left_out, *run.left_out]
+            parts.add("page", lambda: write_page(folder, numbers, float(span), missing))
         run.note("saved" if parts.error is None else f"not all could be saved: {parts.error}")
         parts.write("log", lambda: _write_log(run, folder))
     for line in (*parts.left_out, *run.left_out):

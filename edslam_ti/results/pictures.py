@@ -186,20 +186,26 @@ def fly_through_frames(
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write frames ([H, W, 3] RGB, uint8) as MPEG-4; odd edges are cut off, the format has even sizes."""
+    """Write frames ([H, W, 3] RGB, uint8) as an .mp4 file; odd edges are cut off, it has even sizes."""
     writer = None
     with atomic_file(path) as temporary:
         for frame in frames:
             h, w = (n // 2 * 2 for n in frame.shape[:2])
             if writer is None:
-                code = cv2.VideoWriter.fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(temporary), code, fps, (w, h))
-                if not writer.isOpened():
-                    raise NoEncoderError(f"{path.name}: OpenCV cannot write MPEG-4 here; no video is made")
+                writer = _video_writer(temporary, fps, (w, h))
             writer.write(np.ascontiguousarray(frame[:h, :w, ::-1]))
         if writer is None:
             raise DataError(f"{path.name}: expected at least one frame, got none")
         writer.release()
+
+
+def _video_writer(path: Path, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    """Return a writer of VP9, which browsers play, or of MPEG-4 Part 2 where OpenCV has no VP9."""
+    for code in ("vp09", "mp4v"):
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), fps, size)
+        if writer.isOpened():
+            return writer
+    raise NoEncoderError(f"{path.name}: OpenCV cannot write MPEG-4 here; no video is made")
 
 
 # ---------------------------------------------------------------- matplotlib without global state

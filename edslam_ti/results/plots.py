@@ -15,7 +15,7 @@ from edslam_ti.results.pictures import new_figure, save_figure
 from edslam_ti.results.reading import Result, load_result
 from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import true_poses_at
-from edslam_ti.viewer import frustum_lines
+from edslam_ti.viewer.shapes import frustum_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,12 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from edslam_ti.camera import Camera
+from edslam_ti.datasets.camera_file import read_camera
 from edslam_ti.errors import DataError, LostTrackError, plain
 from edslam_ti.journal import JOURNAL, read_journal
 from edslam_ti.mesh_reading import read_point_cloud, read_triangle_mesh
+from edslam_ti.output import atomic_file
 from edslam_ti.results.run_folder import is_unfinished
 from edslam_ti.trajectory import Trajectory, read_tum
 
+CAMERA = "camera.json"
 MOST_LOST = 0.1  # of the frames; beyond, a run's exit code says that its path is not to be trusted
 
 
@@ -76,6 +80,20 @@ def load_result(folder: Path) -> Result:
         brightness=brightness,
         mesh=mesh,
     )
+
+
+def write_camera(folder: Path, camera: Camera) -> None:
+    """Write a run's camera into its folder, as recordings state theirs."""
+    values = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    with atomic_file(folder / CAMERA) as temporary:
+        temporary.write_text(json.dumps(values | {"pixel_centres": "integer"}, indent=2) + "\n")
+
+
+def read_camera_of(folder: Path) -> Camera:
+    """Return a run's camera; raises DataError where the folder does not say."""
+    if not (folder / CAMERA).is_file():
+        raise DataError(f"{folder}: no {CAMERA} in it; an older version made this run, run it again")
+    return read_camera(folder / CAMERA).camera
 
 
 def require_tracked(folder: Path) -> None:

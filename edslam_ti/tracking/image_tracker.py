@@ -149,6 +149,12 @@ class BrightnessTracker:
         message = "; ".join(text for text in notes if text)
         return replace(result, T_world_camera=path.newest, message=message, corrections=path.corrections)
 
+    def log_brightness(self) -> np.ndarray | None:  # [h, w]
+        """Return the newest frame's image as events determine it, for viewers; None before the first one."""
+        if not isinstance(self._state, Tracking) or not self._segment.recent:
+            return None
+        return self._state.keyframe.image_at(self._segment.recent[-1])
+
     def consistency(self, trajectory: Trajectory) -> Consistency | None:
         """Return whether events and depth told the same motion; None: too little was compared."""
         return self._check.result(trajectory)
