@@ -33,6 +33,7 @@ from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_t
 
 MILLISECOND = 1_000_000  # nanoseconds
 TITLE = "Simulated recording"  # how README.txt begins
+SENSORS = " (simulated "  # how a description names them
 UNKNOWN = "unknown"  # C of a sensor with faults, which nobody knows exactly
 FILES = ("README.txt", "camera.json", "poses_ts.txt", "traj.txt", "surfaces.ply")
 PICTURES = ("images", "depth", "novel_views/images", "novel_views/depth")
@@ -278,7 +279,7 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "distortion_model": None if config.lens is None else config.lens.model,
         "distortion": None if config.lens is None else list(config.lens.coefficients),
         "depth_undistorted": None if config.lens is None else True,
-        "description": scene.description,
+        "description": scene.description + _sensors_in_words(config),
     }
     stated = {name: value for name, value in values.items() if value is not None}
     (folder / "camera.json").write_text(json.dumps(stated, indent=2) + "\n")
@@ -295,6 +296,19 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "novel_views/: true views near the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
         f"Settings:\n{settings}\n"
     )
+
+
+def _sensors_in_words(config: SimulationConfig) -> str:
+    """Return which sensors with faults made the recording; nothing: the usual ones."""
+    words = []
+    for what, stage, usual in (
+        ("sensor", config.sensor, SensorConfig()),
+        ("depth sensor", config.depth_sensor, DepthSensorConfig()),
+    ):
+        if stage != usual:
+            changed = set(stage.model_dump(exclude_none=True)) - {"preset"}
+            words.append(f"{what} {stage.preset}" + (" with changes" if changed else ""))
+    return f"{SENSORS}{', '.join(words)})" if words else ""
 
 
 def _shown_settings(config: SimulationConfig) -> dict[str, Any]:
