@@ -163,6 +163,8 @@ def test_distorted_recording_is_the_undistorted_one_once_it_is_opened(tmp_path: 
     strong = {"distortion": (-0.08, 0.02, 0.0, 0.0)}
     straight = EventReplicaSequence(record_tiny_room(tmp_path / "a", **times))
     bent = EventReplicaSequence(record_tiny_room(tmp_path / "b", **times, sensor=strong))
+    assert bent.description.endswith(" (simulated sensor ideal with changes)")
+    assert bent.contrast_threshold == 0.1  # a lens alone leaves C known
     raw = cv2.imread(str(tmp_path / "b/images/frame000100.png"), cv2.IMREAD_GRAYSCALE) / 255
     inner = np.s_[12:-12, 18:-18]
     expected = straight.image(1)[inner]
