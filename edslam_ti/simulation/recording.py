@@ -67,11 +67,11 @@ def simulate(
     without it. `progress` receives the share done, 0 to 1.
     """
     duration = min(config.duration, path.duration)
-    image_times = _millisecond_times(config.image_rate, duration)
     depth_sensor = config.depth_measured_by
+    image_times = _millisecond_times(*config.image_rhythm, duration)
     depth_times = [
         t
-        for t in _millisecond_times(depth_sensor.rate or config.depth_rate, duration, depth_sensor.phase)
+        for t in _millisecond_times(depth_sensor.rate or config.depth_rate, depth_sensor.phase, duration)
         if not _is_in(config.depth_gap, t)
     ]
     if min(len(image_times), len(depth_times)) < 2:
@@ -115,7 +115,7 @@ def simulate(
             raise DataError(f"recording of {duration:g} s: no event fired; {_why_no_event(render)}")
         pose_times = image_times
         if config.pose_rate is not None:
-            pose_times = _millisecond_times(config.pose_rate, duration)
+            pose_times = _millisecond_times(config.pose_rate, 0.0, duration)
         _write_poses(folder, path, pose_times)
         _write_descriptions(folder, scene, config)
         write_evaluation_truth(
@@ -163,7 +163,7 @@ def _log_intensity(render: Render, config: SimulationConfig) -> np.ndarray:  # [
     return np.log(render.grey + np.float32(config.log_epsilon))
 
 
-def _millisecond_times(rate: float, duration: float, phase: float = 0.0) -> list[int]:
+def _millisecond_times(rate: float, phase: float, duration: float) -> list[int]:
     """Return times phase + k / rate up to the duration, rounded to whole milliseconds, in nanoseconds."""
     count = int(np.floor(duration * rate + 1e-6)) + 1
     stamps = [round(1e3 * phase + 1e3 * k / rate) * MILLISECOND for k in range(count)]
