@@ -49,6 +49,16 @@ def read(line: str) -> Everything:
     return read_options(Everything, line.split(), "edslam test", "A test.")
 
 
+def test_a_stage_may_be_given_by_one_word() -> None:
+    def read(line: str) -> SimulateOptions:
+        return read_options(SimulateOptions, line.split(), "edslam simulate", "")
+
+    options = read("--out x --sensor davis346 --sensor.dead-time 0")
+    assert (options.sensor.preset, options.sensor.dead_time, options.width) == ("davis346", 0.0, 346)
+    with pytest.raises(UsageError, match=r"--sensor\.preset: .* got 'davis34'; did you mean 'davis346'"):
+        read("--out x --sensor davis34")
+
+
 @pytest.mark.parametrize(
     ("words", "name", "value"),
     [

@@ -10,6 +10,7 @@ from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.leftovers import remove_leftovers
 from edslam_ti.simulation import ROOM_NAMES, SimulationConfig, make_path, make_room, simulate
 from edslam_ti.simulation.moving import moving_object
+from edslam_ti.simulation.recording import SENSORS
 from edslam_ti.simulation.truth import write_evaluation_truth
 
 GENERATOR_VERSION = 2  # increase it when rooms, paths or rendering change, so that sequences are made again
@@ -36,7 +37,10 @@ class BuiltinSequence(EventReplicaSequence):
     def __init__(self, folder: Path, contrast_threshold: float | None = None) -> None:
         super().__init__(folder, contrast_threshold)
         if self.scene in ROOM_NAMES:  # the others describe themselves
-            self.description = f"built-in simulated room '{self.scene}', a stand-in for EventReplica's scene"
+            _, begin, sensors = self.description.partition(SENSORS)
+            self.description = (
+                f"built-in simulated room '{self.scene}', a stand-in for EventReplica's scene{begin}{sensors}"
+            )
 
 
 def builtin_sequence_folder(

@@ -33,6 +33,7 @@ from edslam_ti.simulation.truth import DEPTH_UNITS_PER_METRE, write_evaluation_t
 
 MILLISECOND = 1_000_000  # nanoseconds
 TITLE = "Simulated recording"  # how README.txt begins
+SENSORS = " (simulated "  # how a description names them
 UNKNOWN = "unknown"  # C of a sensor with faults, which nobody knows exactly
 FILES = ("README.txt", "camera.json", "poses_ts.txt", "traj.txt", "surfaces.ply")
 PICTURES = ("images", "depth", "novel_views/images", "novel_views/depth")
@@ -66,11 +67,11 @@ def simulate(
     without it. `progress` receives the share done, 0 to 1.
     """
     duration = min(config.duration, path.duration)
-    image_times = _millisecond_times(config.image_rate, duration)
     depth_sensor = config.depth_measured_by
+    image_times = _millisecond_times(*config.image_rhythm, duration)
     depth_times = [
         t
-        for t in _millisecond_times(depth_sensor.rate or config.depth_rate, duration, depth_sensor.phase)
+        for t in _millisecond_times(depth_sensor.rate or config.depth_rate, depth_sensor.phase, duration)
         if not _is_in(config.depth_gap, t)
     ]
     if min(len(image_times), len(depth_times)) < 2:
@@ -114,7 +115,7 @@ def simulate(
             raise DataError(f"recording of {duration:g} s: no event fired; {_why_no_event(render)}")
         pose_times = image_times
         if config.pose_rate is not None:
-            pose_times = _millisecond_times(config.pose_rate, duration)
+            pose_times = _millisecond_times(config.pose_rate, 0.0, duration)
         _write_poses(folder, path, pose_times)
         _write_descriptions(folder, scene, config)
         write_evaluation_truth(
@@ -162,7 +163,7 @@ def _log_intensity(render: Render, config: SimulationConfig) -> np.ndarray:  # [
     return np.log(render.grey + np.float32(config.log_epsilon))
 
 
-def _millisecond_times(rate: float, duration: float, phase: float = 0.0) -> list[int]:
+def _millisecond_times(rate: float, phase: float, duration: float) -> list[int]:
     """Return times phase + k / rate up to the duration, rounded to whole milliseconds, in nanoseconds."""
     count = int(np.floor(duration * rate + 1e-6)) + 1
     stamps = [round(1e3 * phase + 1e3 * k / rate) * MILLISECOND for k in range(count)]
@@ -273,7 +274,7 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "distortion_model": None if config.lens is None else config.lens.model,
         "distortion": None if config.lens is None else list(config.lens.coefficients),
         "depth_undistorted": None if config.lens is None else True,
-        "description": scene.description,
+        "description": scene.description + _sensors_in_words(config),
     }
     stated = {name: value for name, value in values.items() if value is not None}
     (folder / "camera.json").write_text(json.dumps(stated, indent=2) + "\n")
@@ -290,6 +291,19 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
         "novel_views/: true views near the path, depth exact; surfaces.ply: the scene's triangles (m).\n\n"
         f"Settings:\n{settings}\n"
     )
+
+
+def _sensors_in_words(config: SimulationConfig) -> str:
+    """Return which sensors with faults made the recording; nothing: the usual ones."""
+    words = []
+    for what, stage, usual in (
+        ("sensor", config.sensor, SensorConfig()),
+        ("depth sensor", config.depth_sensor, DepthSensorConfig()),
+    ):
+        if stage != usual:
+            changed = set(stage.model_dump(exclude_none=True)) - {"preset"}
+            words.append(f"{what} {stage.preset}" + (" with changes" if changed else ""))
+    return f"{SENSORS}{', '.join(words)})" if words else ""
 
 
 def _shown_settings(config: SimulationConfig) -> dict[str, Any]:

@@ -42,7 +42,8 @@ class SimulationConfig(Stage):
     depth_rate: float = Field(20.0, ge=1e-3, le=1000)
     """Depth images per second; their times are rounded to whole milliseconds."""
     image_rate: float = Field(20.0, ge=1e-3, le=1000)
-    """Grey images and written poses per second; their times are rounded to whole milliseconds."""
+    """Grey images and written poses per second; their times are rounded to whole milliseconds. Left at its
+    default, images come with depth where the depth sensor has a rate of its own, as of an RGB-D camera."""
     depth_noise: Literal["none", "kinect"] = "none"
     """kinect: axial noise, quantised disparity, jittered and missing edges, nothing beyond 5 m."""
     exposure: float = Field(0.0, ge=0, lt=1)
@@ -92,6 +93,14 @@ class SimulationConfig(Stage):
         sensor = SensorConfig.validated(values["sensor"], "sensor")
         size = sensor.sensor.size
         return values if size is None else {"width": size[0], "height": size[1], **values}
+
+    @property
+    def image_rhythm(self) -> tuple[float, float]:
+        """Rate (Hz) of grey images, and time stamp (s) of the first."""
+        sensor, usual = self.depth_sensor.sensor, type(self).model_fields["image_rate"].default
+        if sensor.rate is None or self.image_rate != usual:
+            return self.image_rate, 0.0
+        return sensor.rate, sensor.phase
 
     @property
     def states_threshold(self) -> bool:

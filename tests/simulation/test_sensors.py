@@ -10,6 +10,7 @@ from sequences import record_tiny_room, tiny_room
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
+from edslam_ti.datasets import open_sequence
 from edslam_ti.datasets.builtin import key_of
 from edslam_ti.datasets.event_replica import EventReplicaSequence
 from edslam_ti.errors import ConfigError
@@ -163,6 +164,8 @@ def test_distorted_recording_is_the_undistorted_one_once_it_is_opened(tmp_path: 
     strong = {"distortion": (-0.08, 0.02, 0.0, 0.0)}
     straight = EventReplicaSequence(record_tiny_room(tmp_path / "a", **times))
     bent = EventReplicaSequence(record_tiny_room(tmp_path / "b", **times, sensor=strong))
+    assert bent.description.endswith(" (simulated sensor ideal with changes)")
+    assert bent.contrast_threshold == 0.1  # a lens alone leaves C known
     raw = cv2.imread(str(tmp_path / "b/images/frame000100.png"), cv2.IMREAD_GRAYSCALE) / 255
     inner = np.s_[12:-12, 18:-18]
     expected = straight.image(1)[inner]
@@ -244,6 +247,19 @@ def test_depth_is_of_the_moment_and_the_place_that_the_sensor_states(tmp_path: P
     there = record_tiny_room(tmp_path / "turned", **times, depth_sensor={"rotation": 2.0})
     turned = EventReplicaSequence(there).depth(2)
     assert np.median(np.abs(turned - renderer.render(path.pose(0.1)).depth)) > 5e-3
+
+
+def test_images_come_with_depth_that_has_a_rate_of_its_own() -> None:
+    assert SimulationConfig(depth_sensor="kinect").image_rhythm == (20.0, 0.0)
+    assert SimulationConfig(depth_sensor="realsense").image_rhythm == (30.0, 0.011)
+    assert SimulationConfig(depth_sensor="realsense", image_rate=10.0).image_rhythm == (10.0, 0.0)
+
+
+def test_only_built_in_rooms_have_simulated_sensors(tiny_folder: Path) -> None:
+    settings = {"scene": tiny_folder.name, "data_dir": tiny_folder.parent, "dataset": "event_replica"}
+    for key, value in (("sensor", "typical"), ("depth_sensor", "kinect")):
+        with pytest.raises(ConfigError, match=f"{key}: expected with built-in rooms alone"):
+            open_sequence(Config(**settings).updated({key: value}))
 
 
 def test_presets_of_depth_sensors_measure_most_of_a_wall_to_a_few_millimetres() -> None:
