@@ -135,7 +135,7 @@ def test_live_page_shows_a_run_and_follows_and_the_finished_run_flies(
     until(lambda: browser.ask(wide) >= 2 and scene(browser.picture("live")).std() > 20, SECONDS)
     print(f"splats and images {time.perf_counter() - started:.1f} s after the first frame")
     number = re.compile(r"frame (\d+) of")
-    first = int(number.search(browser.text())[1])  # type: ignore[index]
+    first = int(number.search(browser.text())[1])
     until(lambda: int((number.search(browser.text()) or [0, 0])[1]) > first, 60)
     until(lambda: colour_share(scene(browser.picture("live")), (178, 114, 0)) > 2e-4, 60)  # the path
     assert run.wait(timeout=600) == 0
