@@ -59,7 +59,7 @@ class Browser:
         while True:
             answer = json.loads(self._socket.recv(timeout=120))
             if answer.get("id") == number:
-                return answer["result"]
+                return answer.get("result")  # None: the browser could not
 
     def ask(self, expression: str) -> Any:
         """Return the value of a JavaScript expression."""
@@ -71,7 +71,9 @@ class Browser:
 
     def picture(self, name: str) -> np.ndarray:  # [H, W, 3] BGR
         """Return what the page looks like."""
-        data = base64.b64decode(self.do("Page.captureScreenshot")["data"])
+        while (shot := self.do("Page.captureScreenshot")) is None:  # it is too busy with the page
+            time.sleep(0.5)
+        data = base64.b64decode(shot["data"])
         if PICTURES:
             (Path(PICTURES) / f"{name}.png").write_bytes(data)
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
