@@ -15,7 +15,7 @@ from edslam_ti.errors import EdSlamError, MissingExtraError
 from edslam_ti.viewer.moment import Say
 from edslam_ti.viewer.shapes import opening_view, rgb, up_direction
 
-ASPECT = 1.6  # width over height of a usual browser's page
+ASPECT = 1.1  # width over height of the scene in a usual browser, beside the panel
 HALF_HEIGHT = 0.6  # tangent of half the angle of view where the camera is not known
 
 

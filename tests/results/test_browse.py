@@ -75,7 +75,7 @@ def test_runs_stand_side_by_side_or_in_one_place(page: FinishedPage, server: Any
     half = np.tan(eye.fov / 2)
     assert half == pytest.approx(CAMERA.height / 2 / CAMERA.fy)
     assert np.abs(y / z).max() < half
-    assert np.abs(x / z).max() < 1.6 * half
+    assert np.abs(x / z).max() < 1.1 * half
     page._beside.value = False
     page._arrange()
     np.testing.assert_array_equal(second.position, 0)
