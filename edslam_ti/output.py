@@ -62,6 +62,15 @@ def atomic_folder(path: Path, why_keep: WhyKeep | None = None) -> Iterator[Path]
             shutil.rmtree(temporary, ignore_errors=True)
 
 
+def title_of(folder: Path, length: int) -> str:
+    """Return how the README.txt of a folder begins, `length` characters; nothing where there is none."""
+    try:
+        with (folder / "README.txt").open("rb") as file:
+            return file.read(length).decode(errors="replace")
+    except OSError:
+        return ""
+
+
 def check_replaceable(path: Path, why_keep: WhyKeep | None = None) -> None:
     """Raise `DataError` unless a new folder may take the place of what is at `path`; see `atomic_folder`."""
     if path.name in ("", ".."):

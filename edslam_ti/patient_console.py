@@ -5,6 +5,7 @@ import sys
 from typing import Any, TextIO
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 
 
 class PatientStream:
@@ -53,3 +54,15 @@ def patient_console() -> Console:
         return Console(quiet=True)
     stream: Any = PatientStream(sys.stdout)
     return Console(file=stream)
+
+
+def progress_bar(console: Console, time: ProgressColumn) -> Progress:
+    """Return a bar whose tasks have a field `status`, plain text. `time` shows time elapsed or remaining."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        time,
+        TextColumn("{task.fields[status]}", markup=False),
+        console=console,
+    )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TimeRemainingColumn
 from rich.text import Text
 
 from edslam_ti import kernels
@@ -33,7 +33,7 @@ from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.memory import release_free_memory
 from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.methods import METHODS
-from edslam_ti.patient_console import patient_console, say
+from edslam_ti.patient_console import patient_console, progress_bar, say
 from edslam_ti.results.folder import save
 from edslam_ti.results.run import Run
 from edslam_ti.results.run_folder import FAILED, INTERRUPTED, RUNNING, SETTINGS, RunFolder, point_latest_to
@@ -302,22 +302,11 @@ def held_out_frames(samples: SampledSequence, every: int) -> set[int]:
 # --- the loop ---
 
 
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[status]}", markup=False),
-        console=console,
-    )
-
-
 def _process(state: Run, session: _Session) -> None:
     """Process the frames that have not been processed yet, until a signal comes."""
     slam, mapper = state.slam, state.slam.mapper
     num_unreadable = 0  # in a row
-    with _progress(session.console) as bar:
+    with progress_bar(session.console, TimeRemainingColumn()) as bar:
         first, total = len(slam.results), len(state.samples)
         task = bar.add_task("mapping" if mapper else "tracking", total=total, completed=first, status="")
         ate, error = "", None
@@ -369,7 +358,7 @@ def _show(state: Run, session: _Session, sample: Sample | None, error_cm: float 
 def _finish(state: Run, mapper: Mapper, session: _Session) -> None:
     """Refine the map, until a signal comes."""
     started, interruption = time.perf_counter(), session.interruption
-    with _progress(session.console) as bar:
+    with progress_bar(session.console, TimeRemainingColumn()) as bar:
         task = bar.add_task("refining", total=100, status="")
 
         def report(fraction: float) -> bool:

@@ -17,7 +17,7 @@ from edslam_ti.conversion.pictures import depth_units, exact_scale, write_depth,
 from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.datasets.event_recording import EventRecording
 from edslam_ti.errors import DataError, plain
-from edslam_ti.output import atomic_folder, check_replaceable
+from edslam_ti.output import atomic_folder, check_replaceable, title_of
 
 TITLE = "Converted recording"  # how README.txt begins
 FILES = (
@@ -267,12 +267,7 @@ def _some_depth(sequence: EventDepthSequence) -> list[np.ndarray]:
 
 def why_not_a_conversion(folder: Path) -> str | None:
     """Return what shows that a folder is not, or not only, a converted recording; None: it is one."""
-    try:
-        with (folder / "README.txt").open("rb") as file:
-            title = file.read(len(TITLE)).decode(errors="replace")
-    except OSError:
-        title = ""
-    if title != TITLE:
+    if title_of(folder, len(TITLE)) != TITLE:
         return "holds something else than a converted recording"
     for path in sorted(folder.rglob("*")):
         name, parent = (p.relative_to(folder).as_posix() for p in (path, path.parent))

@@ -17,7 +17,7 @@ from edslam_ti.errors import ConfigError
 from edslam_ti.experiments.html_report import write_html
 from edslam_ti.experiments.jobs import EXACT, KINECT, Job, Outcome
 from edslam_ti.experiments.paper_options import LongOptions
-from edslam_ti.experiments.paper_tables import cell_of, without_result
+from edslam_ti.experiments.paper_tables import cell_of, several_programs, without_result
 from edslam_ti.experiments.paper_views import ShownRun, groups_of
 from edslam_ti.experiments.scheduler import in_processes, on_ray, run_jobs
 from edslam_ti.experiments.table_text import LOW, Column, Row, Table, as_latex, as_markdown
@@ -158,5 +158,6 @@ def long_table(outcomes: Sequence[Outcome]) -> Table:
         "drift: distance from the truth when both start at the same pose; the path ends where it began",
         "as first tracked: before loop closure and the map corrected earlier poses",
         *without_result(outcomes),
+        *several_programs(outcomes),
     )
     return Table("long", "Long paths", ("data", "method"), columns, tuple(rows), notes).with_best()

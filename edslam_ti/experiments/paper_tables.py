@@ -117,7 +117,7 @@ def _comparison(
     rows += _published_rows(protocol, outcomes, scenes, measures, sources)
     table = Table(name, title, labels, columns, tuple(rows), variant=protocol).with_best()
     notes = [*_spread_note(outcomes), *where_others_win(table), *without_result(outcomes)]
-    notes += _inputs(outcomes)
+    notes += [*several_programs(outcomes), *_inputs(outcomes)]
     if any("†" in label for row in rows for label in row.labels):
         notes.append(OTHER_DATA)
         notes.append("bold: the best of our runs on the same data; of published numbers, the best we know")
@@ -193,6 +193,7 @@ def ablation(name: str, outcomes: Sequence[Outcome]) -> Table:
         *(f"{PATHS_OF[p]}; {VIEWS_OF[p].partition(': ')[2]}" for p in groups),
         *_spread_note(outcomes),
         *without_result(outcomes),
+        *several_programs(outcomes),
         f"paper: Table {number} of the ED-SLAM paper, EventReplica office0. {OTHER_DATA}",
     )
     return Table(
@@ -244,6 +245,7 @@ def runtime(outcomes: Sequence[Outcome]) -> Table:
         "file, with evaluation and pictures. Map: map.ply, or points.ply where the map is a volume",
         "tracking and mapping run in turn; every run is a process of its own",
         *without_result(outcomes),
+        *several_programs(outcomes),
         "† on other data and other machines",
         *sources.lines(),
     )
@@ -329,6 +331,15 @@ def without_result(outcomes: Sequence[Outcome]) -> list[str]:
         f"without a result: {method}, {', '.join(_unique(names))}: {reason}"
         for (method, reason), names in reasons.items()
     ]
+
+
+def several_programs(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return a line where the runs were not all made by one version of the program."""
+    commits = [o["commit"] for o in outcomes if "commit" in o]
+    if len(set(commits)) < 2:
+        return []
+    counts = ", ".join(f"{commit} ({commits.count(commit)})" for commit in _unique(commits))
+    return [f"runs by versions of the program: {counts}"]
 
 
 def _inputs(outcomes: Sequence[Outcome]) -> list[str]:

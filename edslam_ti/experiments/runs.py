@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from edslam_ti import __version__, kernels
 from edslam_ti.config import Config, dataset_differences
@@ -23,6 +23,7 @@ from edslam_ti.experiments.cases import MEASURED, Case, Recording
 from edslam_ti.experiments.recordings import Recordings
 from edslam_ti.methods import METHODS
 from edslam_ti.output import atomic_file
+from edslam_ti.patient_console import progress_bar
 from edslam_ti.pipeline import contrast_of, make_slam
 from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
@@ -139,7 +140,7 @@ def run_all(
     other cases still run, and the next call tries the failed and skipped ones again.
     """
     is_started = False
-    with _progress(console) as bar:
+    with progress_bar(console, TimeElapsedColumn()) as bar:
         task = bar.add_task("bench", total=len(cases) * len(variants), status="")
 
         def report(what: str, share: float) -> None:
@@ -237,14 +238,3 @@ def _kept(file: Path) -> dict[str, Any] | None:
         return None
     result: dict[str, Any] = json.loads(file.read_text())
     return None if "error" in result or "skipped" in result else result
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[status]}"),
-        console=console,
-    )

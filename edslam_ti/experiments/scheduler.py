@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from edslam_ti.errors import ConfigError, MissingExtraError, plain
-from edslam_ti.experiments.jobs import RESULT, Job, Outcome, job_of, kept, outcome_of, start
+from edslam_ti.experiments.jobs import RESULT, Job, Outcome, job_of, kept, outcome_of, source_commit, start
 from edslam_ti.output import atomic_file
+from edslam_ti.patient_console import progress_bar
 
 Work = tuple[Job, Path]  # a job and its folder
 Finished = tuple[Job, Outcome]
@@ -37,7 +38,7 @@ def run_jobs(
     """
     jobs = list(dict.fromkeys(jobs))
     todo: list[Work] = []
-    done = 0
+    done, others = 0, 0
     for job in jobs:
         folder = out / "runs" / job.name
         if fresh:
@@ -47,10 +48,16 @@ def run_jobs(
             todo.append((job, folder))
         else:
             done += 1
+            others += outcome.get("commit") != source_commit()
             yield outcome
+    if others:
+        console.print(
+            f"{others} of {done} finished runs are of another version of the program; --fresh repeats all",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
     if not todo:
         return
-    with _progress(console) as bar:
+    with progress_bar(console, TimeElapsedColumn()) as bar:
         task = bar.add_task("runs", total=len(jobs), completed=done, status="")
         for _, outcome in executor(todo, lambda status: bar.update(task, status=status)):
             bar.advance(task)
@@ -216,14 +223,3 @@ def _gathered(job: Job, folder: Path, get: Callable[[], dict[str, bytes]]) -> Ou
         with atomic_file(folder / name) as temporary:
             temporary.write_bytes(content)
     return outcome_of(job, folder, code)
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[status]}", markup=False),
-        console=console,
-    )

@@ -43,7 +43,7 @@ class ChangeMapper(ShownMap):
     """
 
     def __init__(self, camera: Camera, contrast: ContrastThreshold, config: Config) -> None:
-        super().__init__(camera, config.mapping)
+        super().__init__(camera, config)
         self.loss = float("nan")  # running mean of Eq. 12
         self.num_steps = 0  # taken so far
         self.budget = Budget(config.mapping.budget)

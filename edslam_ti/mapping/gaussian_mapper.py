@@ -16,12 +16,12 @@ from edslam_ti.geometry import is_near
 from edslam_ti.mapping.budget import Budget, prune_faded
 from edslam_ti.mapping.densification import Densifier, scene_size
 from edslam_ti.mapping.insertion import new_gaussians
-from edslam_ti.mapping.keyframes import Keyframe, covisibility, is_keyframe
+from edslam_ti.mapping.keyframes import Keyframe
 from edslam_ti.mapping.losses import map_loss
 from edslam_ti.mapping.mapper import Progress
 from edslam_ti.mapping.poses import MapAligner, PoseMemory, PoseRefiner, StepPose
 from edslam_ti.mapping.recolouring import recolour
-from edslam_ti.mapping.rendering import RenderOutput, drawable
+from edslam_ti.mapping.rendering import drawable
 from edslam_ti.mapping.shown_map import ShownMap
 from edslam_ti.mapping.targets import EventImages, FrameSampler, evenly
 from edslam_ti.trajectory import Trajectory
@@ -63,13 +63,12 @@ class GaussianMapper(ShownMap):
         config: Config,
         sharp_images: SharpImages | None = None,
     ) -> None:
-        super().__init__(camera, config.mapping)
+        super().__init__(camera, config)
         self.keyframes: list[Keyframe] = []
         self.images = EventImages(camera, contrast, config.mapping, sharp_images)
         self.budget = Budget(config.mapping.budget)
         self.loss = float("nan")  # running mean of the event loss
         self.num_steps = 0  # taken so far
-        self._keyframe_config = config.keyframes
         self._random = np.random.default_rng(config.seed + 1)
         self._sampler = FrameSampler(self._random, config.keyframes.num_chunks)
         # Bundle adjustment refines tracked poses; true ones stay as they are.
@@ -205,7 +204,8 @@ class GaussianMapper(ShownMap):
         """Add Gaussians where the map lacks the frame's depth; add a keyframe if it sees enough new."""
         T, config = trajectory.pose(index), self._config
         view = self._view(T)
-        if not self.keyframes or self._sees_enough_new(view, depth, index, trajectory):
+        last = trajectory.pose(self.keyframes[-1].index) if self.keyframes else None
+        if last is None or self._sees_enough_new(view, depth, T, last):
             self.keyframes.append(Keyframe(index))
         alpha, rendered_depth = view.alpha.numpy(), view.expected_depth.numpy()
         new = new_gaussians(depth, alpha, rendered_depth, self._camera, T, len(self.gaussians), config)
@@ -226,16 +226,6 @@ class GaussianMapper(ShownMap):
             torch.from_numpy(new.is_measured),
         )
 
-    def _sees_enough_new(
-        self, view: RenderOutput, depth: np.ndarray, index: int, trajectory: Trajectory
-    ) -> bool:
-        T_last, T_now = trajectory.pose(self.keyframes[-1].index), trajectory.pose(index)
-        shared = covisibility(view.visible, self._view(T_last).visible)
-        translation = float(np.linalg.norm(T_now[:3, 3] - T_last[:3, 3]))
-        measured = depth[depth > 0]
-        median_depth = float(np.median(measured)) if len(measured) else np.inf
-        return is_keyframe(shared, translation, median_depth, self._keyframe_config)
-
     def _densifier(self, trajectory: Trajectory) -> Densifier:
         config, size = self._config, scene_size(self.gaussians, trajectory.poses[:, :3, 3])
         seed = int(self._random.integers(1 << 31))
@@ -255,6 +245,8 @@ class GaussianMapper(ShownMap):
         was_solved, epsilon = self.images.is_solved, self._config.log_epsilon
         newest = evenly(self.images.newest_frames, MAX_RECOLOURED)
         changed = self.images.frames if is_thorough or not was_solved else newest
+        if not changed:  # a window has just begun, and no frame of it is kept so far
+            return was_solved
         before = {k: self.images.log_brightness(k) for k in changed} if was_solved else {}
         if not self.images.solve(trajectory, is_thorough):
             return False

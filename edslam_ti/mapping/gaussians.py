@@ -71,7 +71,8 @@ class GaussianMap:
         self._cell_sizes = torch.tensor(config.brightness_cells)
         self._cells = torch.empty((0, len(self._cell_sizes)), dtype=torch.int64)  # [N, L] table entries
         self._cell_table = torch.zeros(len(self._cell_sizes) * CELL_TABLE, requires_grad=True)
-        self._cell_adam = torch.optim.Adam([self._cell_table], lr=config.cells_rate, eps=1e-15, fused=True)
+        self._cell_moments = Moments.zeros_like(self._cell_table.detach())
+        self._cell_steps = torch.tensor(0.0)
         self._cell_rate = config.cells_rate
 
     def __len__(self) -> int:
@@ -196,25 +197,16 @@ class GaussianMap:
         """Take one Adam step along the gradients, and clear them."""
         for name, value in self._raw.items():
             if value.grad is not None:
-                self._move(value, self._moments[name], self._rates[name] * self._rate_factor)
-                value.grad = None
-        self._cell_adam.step()
-        self._cell_adam.zero_grad(set_to_none=True)
+                steps = torch.tensor(float(self._steps))
+                _move(value, self._moments[name], steps, self._rates[name] * self._rate_factor)
+        if self._cell_table.grad is not None:
+            rate = self._cell_rate * self._rate_factor
+            _move(self._cell_table, self._cell_moments, self._cell_steps, rate)
         self._steps += 1
-
-    @torch.no_grad()
-    def _move(self, value: Tensor, moments: "Moments", rate: float) -> None:
-        assert value.grad is not None
-        adam(
-            [value], [value.grad], [moments.first], [moments.second], [], [torch.tensor(float(self._steps))],
-            amsgrad=False, beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-15, maximize=False,
-            fused=True,  # one pass over the memory instead of eight
-        )  # fmt: skip
 
     def decay_rates(self, factor: float) -> None:
         """Set every learning rate to `factor` times its configured value."""
         self._rate_factor = factor
-        self._cell_adam.param_groups[0]["lr"] = self._cell_rate * factor
 
     def _cells_of(self, means: Tensor) -> Tensor:  # [M, 3] -> [M, L]
         """Return the entry of the brightness table that each mean shares at every cell size."""
@@ -241,3 +233,18 @@ class GaussianMap:
 def _logit(colors: Tensor) -> Tensor:
     """Return the logit of brightness, clamped where gradients would vanish."""
     return colors.clamp(0.002, 0.998).logit()
+
+
+@torch.no_grad()
+def _move(value: Tensor, moments: Moments, num_steps: Tensor, rate: float) -> None:
+    """Take an Adam step along the gradient, clear it, and count the step.
+
+    Making a `torch.optim.Adam` would import torch's compiler, which takes seconds.
+    """
+    assert value.grad is not None
+    adam(
+        [value], [value.grad], [moments.first], [moments.second], [], [num_steps],
+        amsgrad=False, beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-15, maximize=False,
+        fused=True,  # one pass over the memory instead of eight
+    )  # fmt: skip
+    value.grad = None

@@ -18,8 +18,6 @@ from edslam_ti.mapping.change_loss import depth_loss
 from edslam_ti.mapping.change_mapper import ChangeMapper
 from edslam_ti.mapping.gaussians import GaussianMap, Gaussians
 from edslam_ti.mapping.insertion import new_gaussians
-from edslam_ti.mapping.keyframes import covisibility, is_keyframe
-from edslam_ti.mapping.rendering import RenderOutput
 from edslam_ti.trajectory import Trajectory
 
 
@@ -36,7 +34,6 @@ class PaperMapper(ChangeMapper):
 
     def __init__(self, camera: Camera, contrast: ContrastThreshold, config: Config) -> None:
         super().__init__(camera, contrast, config)
-        self._keyframe_config = config.keyframes
         self._keyframes: list[_DepthKeyframe] = []
 
     def keyframe_indices(self) -> list[int]:
@@ -60,7 +57,8 @@ class PaperMapper(ChangeMapper):
         """Add Gaussians where Eq. 13 says, and a keyframe if the frame sees enough that is new."""
         T, config = trajectory.pose(index), self._config
         view = self._view(T)
-        if not self._keyframes or self._sees_enough_new(view, depth, index, trajectory):
+        last = trajectory.pose(self._keyframes[-1].index) if self._keyframes else None
+        if last is None or self._sees_enough_new(view, depth, T, last):
             self._keyframes.append(_DepthKeyframe(index, depth))
         alpha, rendered_depth = view.alpha.numpy(), view.expected_depth.numpy()
         new = new_gaussians(depth, alpha, rendered_depth, self._camera, T, len(self.gaussians), config)
@@ -78,16 +76,6 @@ class PaperMapper(ChangeMapper):
             index,
             torch.from_numpy(new.is_measured),
         )
-
-    def _sees_enough_new(
-        self, view: RenderOutput, depth: np.ndarray, index: int, trajectory: Trajectory
-    ) -> bool:
-        T_last, T_now = trajectory.pose(self._keyframes[-1].index), trajectory.pose(index)
-        shared = covisibility(view.visible, self._view(T_last).visible)
-        translation = float(np.linalg.norm(T_now[:3, 3] - T_last[:3, 3]))
-        measured = depth[depth > 0]
-        median_depth = float(np.median(measured)) if len(measured) else np.inf
-        return is_keyframe(shared, translation, median_depth, self._keyframe_config)
 
     def _drop_surplus(self, newest: int) -> None:
         """Keep the newest N chunks, and the N around every keyframe (N = 5, Sec. III-E)."""

@@ -20,7 +20,7 @@ import numpy as np
 from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays, EventSensorState, simulate_events
-from edslam_ti.output import atomic_folder, check_replaceable, write_npy_header
+from edslam_ti.output import atomic_folder, check_replaceable, title_of, write_npy_header
 from edslam_ti.simulation.depth_noise import kinect_depth
 from edslam_ti.simulation.moving import MovingObject, MovingRenderer
 from edslam_ti.simulation.paths import CameraPath
@@ -136,12 +136,7 @@ def _why_no_event(render: Render) -> str:
 
 def why_not_a_recording(folder: Path) -> str | None:
     """Return what shows that a folder is not, or not only, a simulated recording; None: it is one."""
-    try:
-        with (folder / "README.txt").open("rb") as file:
-            title = file.read(len(TITLE)).decode(errors="replace")
-    except OSError:
-        title = ""
-    if title != TITLE:
+    if title_of(folder, len(TITLE)) != TITLE:
         return "holds something else than a simulated recording"
     for path in _entries(folder):
         name = path.relative_to(folder).as_posix()

@@ -7,28 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from event_files.reading import everything
 from event_files.written_bags import BagWriter
 from event_files.written_prophesee import Event, evt3_words, some_events
 
 from edslam_ti.errors import DataError, MissingExtraError
 from edslam_ti.event_files import EventStream, open_events
 from edslam_ti.event_files.bags import bag_images, bag_imu, bag_topics, sensor_clock_zero
-from edslam_ti.events import Events
 
 SIZE = (1280, 720)
 START = 1_700_000_000_123_456_789  # ns
 KINDS = ("bag", "db3", "mcap")
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "events"
-
-
-def everything(stream: EventStream) -> Events:
-    first, last = stream.time_range
-    return stream.between(first, np.nextafter(last, np.inf))
 
 
 def assert_holds(stream: EventStream, events: list[Event], start: int = 0) -> None:

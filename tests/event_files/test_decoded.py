@@ -8,26 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from event_files.reading import everything
 from event_files.written_aedat4 import write_aedat4
 from event_files.written_prophesee import SIZE, Event, some_events, write_raw
 
 from edslam_ti.errors import DataError, MissingExtraError
 from edslam_ti.event_files import EventStream, open_events
 from edslam_ti.event_files.aedat4 import aedat4_images, aedat4_imu, aedat4_streams
-from edslam_ti.events import Events
 
 START = 1_700_000_000_000_000  # us
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("EDSLAM_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "events"
-
-
-def everything(stream: EventStream) -> Events:
-    first, last = stream.time_range
-    return stream.between(first, np.nextafter(last, np.inf))
 
 
 def assert_holds(stream: EventStream, events: list[Event]) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import io
 import json
 import os
 import re
@@ -28,7 +29,7 @@ from edslam_ti.experiments.documents import cell, report_tables
 from edslam_ti.experiments.jobs import RECORDED, Job, Outcome, about, execute, job_of, kept, outcome_of, start
 from edslam_ti.experiments.paper_options import LongOptions, PaperOptions
 from edslam_ti.experiments.paper_plan import TABLES, Wanted, plan
-from edslam_ti.experiments.paper_tables import tables_of
+from edslam_ti.experiments.paper_tables import several_programs, tables_of
 from edslam_ti.experiments.paper_views import ShownRun
 from edslam_ti.experiments.published import FULL, PAPER_SCENES, PUBLISHED, SLICES, best
 from edslam_ti.experiments.scheduler import Work, in_processes, on_ray, resources, run_jobs
@@ -130,6 +131,22 @@ def test_finished_runs_are_not_repeated_and_failed_ones_are(tmp_path: Path) -> N
     for left in ("", '{"job": {}, "met'):
         (folder / "result.json").write_text(left)
         assert kept(folder) is None
+
+
+def test_finished_runs_of_another_program_are_counted_and_named(tmp_path: Path) -> None:
+    jobs = plan(Wanted(("office0", "room0"), ("ed_slam",)), ("table4",))["table4"]
+    list(run_jobs(jobs, tmp_path, fake, QUIET))
+    console = Console(file=io.StringIO(), width=200)
+    list(run_jobs(jobs, tmp_path, fake, console))
+    assert console.file.getvalue() == ""  # type: ignore[attr-defined]
+    file = tmp_path / "runs" / jobs[0].name / "result.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"commit": "0ther00"}))
+    outcomes = list(run_jobs(jobs, tmp_path, fake, console))
+    said = console.file.getvalue()  # type: ignore[attr-defined]
+    assert said.startswith("1 of 2 finished runs are of another version of the program; --fresh")
+    now = about(jobs[1])["commit"]
+    assert several_programs(outcomes) == [f"runs by versions of the program: 0ther00 (1), {now} (1)"]
+    assert several_programs(outcomes[1:]) == []
 
 
 def tiny_job(folder: Path, method: str = "ed_slam", **differences: Any) -> Job:
