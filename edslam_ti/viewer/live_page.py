@@ -126,7 +126,8 @@ class LivePage:
     def status(self, moment: Moment) -> str:
         """Return how far the run is, as HTML."""
         stage = "refining the map" if moment.sample is None else "running"
-        parts = [f"{stage}: frame {len(moment.trajectory)} of {moment.num_frames}, {moment.hertz:.1f} Hz"]
+        of_all = f" of {moment.num_frames}" if moment.num_frames else ""
+        parts = [f"{stage}: frame {len(moment.trajectory)}{of_all}, {moment.hertz:.1f} Hz"]
         if moment.mapper is not None:
             parts.append(f"{moment.mapper.num_gaussians:,} Gaussians, loss {moment.mapper.loss:.3f}")
         if moment.error_cm is not None:

@@ -14,7 +14,7 @@ from edslam_ti.errors import EdSlamError
 from edslam_ti.open3d_loader import load_open3d
 from edslam_ti.results.window import show_results
 from edslam_ti.trajectory import Trajectory
-from edslam_ti.viewer import VIEWERS, Moment, Open3dViewer, Viewers, make_viewers
+from edslam_ti.viewer import VIEWERS, Moment, NoViewer, Open3dViewer, Viewer, Viewers, make_viewers
 from edslam_ti.viewer.shapes import (
     KEYFRAME_COLOUR,
     frustum_lines,
@@ -107,6 +107,13 @@ def test_without_a_viewer_nothing_is_asked_of_the_map() -> None:
     viewer.wait(lambda: False)
     viewer.close()
     assert all(hasattr(Config(), name) for name in VIEWERS)
+
+
+def test_no_viewer_does_what_viewers_do() -> None:
+    viewer: Viewer = NoViewer()
+    viewer.update(moment(PATH))
+    viewer.wait(lambda: pytest.fail("nobody can pause it"))
+    viewer.close()
 
 
 def test_viewer_that_fails_is_left_out_and_named() -> None:
