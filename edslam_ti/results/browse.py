@@ -19,6 +19,7 @@ from edslam_ti.viewer.server import (
     open_server,
     place_eye,
     set_up,
+    words,
 )
 from edslam_ti.viewer.shapes import TRUTH_COLOUR, frustum_lines, path_lines
 
@@ -74,8 +75,7 @@ class FinishedPage:
 
     def _add_controls(self) -> None:
         gui, runs = self._server.gui, self._runs
-        lines = [f"**{k + 1}** {plain(run.title, 200)}" for k, run in enumerate(runs)]
-        gui.add_markdown("  \n".join(line.replace("<", "&lt;") for line in lines))
+        gui.add_html(words(*(f"{k + 1}: {plain(run.title, 200)}" for k, run in enumerate(runs))))
         kinds = [kind for kind in KINDS if any(run.has(kind) for run in runs)] or ["none"]
         self._kind = gui.add_dropdown("Show", kinds, initial_value=kinds[0])
         self._kind.on_update(lambda event: self._show_kind())
@@ -91,7 +91,7 @@ class FinishedPage:
         self._play.on_click(lambda event: self._toggle_play())
         with gui.add_folder("Measure"):
             self._measure = gui.add_checkbox("Distance between two clicks", False)
-            self._distance = gui.add_markdown("")
+            self._distance = gui.add_html("")
         self._measure.on_update(lambda event: self._begin_measuring())
         self._add_comparison()
         add_screenshot_button(self._server)
@@ -170,7 +170,7 @@ class FinishedPage:
             self._server.scene.remove_click_callback()
             self._distance.content = ""
             return
-        self._distance.content = "click two points of the map"
+        self._distance.content = words("click two points of the map")
         self._server.scene.on_click()(lambda event: self.pick(event.ray_origin, event.ray_direction))
 
     def _forget_measured(self) -> None:
@@ -188,14 +188,14 @@ class FinishedPage:
         ]
         known = [hit for hit in hits if hit is not None]
         if not known:
-            self._distance.content = "there is no point of the map; click again"
+            self._distance.content = words("there is no point of the map; click again")
             return
         point = min(known, key=lambda hit: float(np.linalg.norm(hit - origin)))
         self._picked.append(point)
         name, scene = f"/measured/{len(self._picked)}", self._server.scene
         colour = (204, 121, 167)
         self._measured.append(scene.add_icosphere(name, 0.012, color=colour, position=tuple(point)))
-        self._distance.content = "one point; click another"
+        self._distance.content = words("one point; click another")
         if len(self._picked) == 2:
             first, second = self._picked
             text = f"{np.linalg.norm(second - first):.3f} m"
@@ -204,7 +204,7 @@ class FinishedPage:
             )
             place = tuple((first + second) / 2)
             self._measured.append(scene.add_label("/measured/label", text, position=place))
-            self._distance.content = f"**{text}**"
+            self._distance.content = words(text)
 
     # --- render and truth ---
 

@@ -5,9 +5,20 @@ from collections.abc import Callable
 from edslam_ti.config import Config
 from edslam_ti.errors import plain
 from edslam_ti.viewer.live import BrowserViewer
-from edslam_ti.viewer.moment import Moment, Say, Viewer
+from edslam_ti.viewer.moment import Moment, NoViewer, Say, Viewer
 from edslam_ti.viewer.rerun_log import RerunLog
 from edslam_ti.viewer.window import Open3dViewer
+
+__all__ = [
+    "VIEWERS",
+    "BrowserViewer",
+    "Moment",
+    "NoViewer",
+    "Open3dViewer",
+    "Viewer",
+    "Viewers",
+    "make_viewers",
+]
 
 # By the setting that asks for it; a viewer is made when a run starts and may raise EdSlamError.
 VIEWERS: dict[str, Callable[[Config, Say], Viewer]] = {

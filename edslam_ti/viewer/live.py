@@ -19,7 +19,7 @@ from edslam_ti.viewer.shapes import keyframe_indices
 from edslam_ti.viewer.splats import SplatStream
 from edslam_ti.viewer.throttle import Throttle
 
-SHARE, ALLOWANCE = 0.05, 0.6  # of the time, and seconds at first, for an open page
+SHARE, ALLOWANCE = 0.04, 0.4  # of the processor's time, and seconds at first, for an open page
 OFTEN = 0.1  # seconds between two updates at least
 MOST_POINTS = 50_000  # of a map without Gaussians
 CHECK = 0.05  # seconds between looks at the buttons while paused

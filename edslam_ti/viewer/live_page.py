@@ -9,7 +9,7 @@ import numpy as np
 from edslam_ti.camera import Camera
 from edslam_ti.errors import plain
 from edslam_ti.viewer.moment import Moment
-from edslam_ti.viewer.server import add_lines, add_screenshot_button, look_through, place_eye, set_up
+from edslam_ti.viewer.server import add_lines, add_screenshot_button, look_through, place_eye, set_up, words
 from edslam_ti.viewer.shapes import (
     KEYFRAME_COLOUR,
     PATH_COLOUR,
@@ -53,7 +53,7 @@ class LivePage:
         self._lock = threading.Lock()
         self._is_paused, self._steps = False, 0
         gui = server.gui
-        self._status = gui.add_markdown("waiting for the first frame")
+        self._status = gui.add_html(words("waiting for the first frame"))
         self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self._step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT, hint="one frame further")
         self._follow = gui.add_checkbox("Follow camera", False)
@@ -124,16 +124,17 @@ class LivePage:
         return {name: np.array(values) for name, values in self._curves.items()}
 
     def status(self, moment: Moment) -> str:
-        """Return how far the run is, in Markdown."""
+        """Return how far the run is, as HTML."""
         stage = "refining the map" if moment.sample is None else "running"
-        parts = [f"**{stage}**: frame {len(moment.trajectory)} of {moment.num_frames}, {moment.hertz:.1f} Hz"]
+        of_all = f" of {moment.num_frames}" if moment.num_frames else ""
+        parts = [f"{stage}: frame {len(moment.trajectory)}{of_all}, {moment.hertz:.1f} Hz"]
         if moment.mapper is not None:
             parts.append(f"{moment.mapper.num_gaussians:,} Gaussians, loss {moment.mapper.loss:.3f}")
         if moment.error_cm is not None:
             parts.append(f"error so far {moment.error_cm:.2f} cm")
         if moment.slam.results and not moment.slam.results[-1].converged:
             parts.append(f"lost: {plain(moment.slam.results[-1].message, 100)}")
-        return "  \n".join(parts)
+        return words(*parts)
 
     # --- what is shown ---
 
@@ -189,4 +190,4 @@ class LivePage:
 
     def end(self) -> None:
         """Say that the run has ended."""
-        self._status.content = "the run has ended and is saved: `edslam view RESULT --viewer` shows it again"
+        self._status.content = words("the run has ended; edslam view RESULT --viewer shows it again")

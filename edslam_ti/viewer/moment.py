@@ -25,7 +25,7 @@ class Moment:
     slam: Slam
     camera: Camera
     sample: Sample | None  # the newest frame's data; None while the map is refined
-    num_frames: int  # of the whole run
+    num_frames: int = 0  # of the whole run; 0: not known
     truth: Trajectory | None = None
     error_cm: float | None = None  # ATE so far, where the truth is known
 
@@ -62,3 +62,16 @@ class Viewer(Protocol):
 
     def close(self) -> None:
         """Stop showing, because the run has been saved."""
+
+
+class NoViewer:
+    """Shows nothing."""
+
+    def update(self, moment: Moment) -> None:
+        """Do nothing."""
+
+    def wait(self, is_ended: Callable[[], bool]) -> None:
+        """Return at once."""
+
+    def close(self) -> None:
+        """Do nothing."""

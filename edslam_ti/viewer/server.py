@@ -5,6 +5,7 @@ import io
 import ipaddress
 import socket
 from collections.abc import Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from edslam_ti.errors import EdSlamError, MissingExtraError
 from edslam_ti.viewer.moment import Say
 from edslam_ti.viewer.shapes import opening_view, rgb, up_direction
 
-ASPECT = 1.6  # width over height of a usual browser's page
+ASPECT = 1.1  # width over height of the scene in a usual browser, beside the panel
 HALF_HEIGHT = 0.6  # tangent of half the angle of view where the camera is not known
 
 
@@ -121,6 +122,12 @@ def wxyz_of(T_world_camera: np.ndarray) -> np.ndarray:  # [4, 4] -> [4]
 
 
 # --- what both pages have ---
+
+
+def words(*lines: str) -> str:
+    """Return lines as HTML in which nothing is markup: names come from recordings."""
+    inside = "<br>".join(escape(line) for line in lines)
+    return f'<div style="margin: 0.4em 1em; font-size: 0.9em; overflow-wrap: anywhere">{inside}</div>'
 
 
 def add_lines(server: Any, name: str, lines: Sequence[np.ndarray], color: str, width: float) -> Any:

@@ -1,18 +1,20 @@
 """Viewers: what the window draws, where it opens, and what happens without a display."""
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from saved_results import CAMERA, curve
+from saved_results import CAMERA, curve, write_result
 
 from edslam_ti.config import Config
 from edslam_ti.errors import EdSlamError
 from edslam_ti.open3d_loader import load_open3d
+from edslam_ti.results.window import show_results
 from edslam_ti.trajectory import Trajectory
-from edslam_ti.viewer import VIEWERS, Moment, Open3dViewer, Viewers, make_viewers
+from edslam_ti.viewer import VIEWERS, Moment, NoViewer, Open3dViewer, Viewer, Viewers, make_viewers
 from edslam_ti.viewer.shapes import (
     KEYFRAME_COLOUR,
     frustum_lines,
@@ -31,6 +33,7 @@ class Window:
     def __init__(self) -> None:
         self.shapes: list[Any] = []
         self.num_updates = 0
+        self.num_seen = 0  # shapes while a person looks
         self.parameters: Any = None
 
     def create_window(self, window_name: str, width: int, height: int) -> bool:
@@ -52,6 +55,9 @@ class Window:
 
     def poll_events(self) -> None:
         pass
+
+    def run(self) -> None:
+        self.num_seen = len(self.shapes)
 
     def update_renderer(self) -> None:
         pass
@@ -103,6 +109,13 @@ def test_without_a_viewer_nothing_is_asked_of_the_map() -> None:
     assert all(hasattr(Config(), name) for name in VIEWERS)
 
 
+def test_no_viewer_does_what_viewers_do() -> None:
+    viewer: Viewer = NoViewer()
+    viewer.update(moment(PATH))
+    viewer.wait(lambda: pytest.fail("nobody can pause it"))
+    viewer.close()
+
+
 def test_viewer_that_fails_is_left_out_and_named() -> None:
     class Broken:
         def __getattr__(self, name: str) -> Any:
@@ -148,6 +161,14 @@ def test_window_opens_where_the_first_camera_stood(window: Window) -> None:
     np.testing.assert_allclose(view, opening_view(start.poses, 360 / 625, 640 / 625), atol=1e-12)
     intrinsic = window.parameters.intrinsic
     assert (intrinsic.width, intrinsic.height) == (1280, 720)
+
+
+def test_finished_runs_open_where_the_first_camera_stood(window: Window, tmp_path: Path) -> None:
+    show_results([write_result(tmp_path)])
+    assert window.num_seen == 2  # path and mesh
+    assert window.shapes == []
+    view = np.linalg.inv(window.parameters.extrinsic)
+    np.testing.assert_allclose(view, opening_view(PATH.poses, 360 / 625, 640 / 625), atol=1e-6)
 
 
 @pytest.mark.parametrize("shift", [[0, 0, 0], [0, 0, -5], [4, 0, 0], [0, -3, 1]])
