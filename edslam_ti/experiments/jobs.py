@@ -119,7 +119,8 @@ class Job:
     def name(self) -> str:
         """The job's folder, below the folder of all: readable, and another for every other job."""
         depth = self.depth if self.depth_sensor == "exact" else self.depth_sensor
-        kind = f"{depth}-{self.rate:g}hz" if self.dataset == "builtin" else RECORDED
+        rate = DEPTH_PRESETS[self.depth_sensor].rate or self.rate
+        kind = f"{depth}-{rate:g}hz" if self.dataset == "builtin" else RECORDED
         kind = kind if self.sensor == "ideal" else f"{self.sensor}-{kind}"
         facts = {name: value for name, value in asdict(self).items() if self._counts(name)}
         if self.dataset == "builtin":
