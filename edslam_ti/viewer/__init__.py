@@ -15,6 +15,7 @@ __all__ = [
     "Moment",
     "NoViewer",
     "Open3dViewer",
+    "RerunLog",
     "Viewer",
     "Viewers",
     "make_viewers",
