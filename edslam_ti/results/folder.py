@@ -81,6 +81,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
             metrics = parts.write("metrics", lambda: run_metrics(run, None, None, NO_VIEWS, None, trust))
         if metrics is not None:
             numbers = metrics | cost_metrics(run, saving_seconds=time.perf_counter() - started)
+            numbers |= run.live_metrics
             text = json.dumps(numbers, indent=2) + "\n"
             parts.write("metrics", lambda: _write_text(folder / "metrics.json", text))
             for line in (*numbers["data_notes"], *numbers["problems"], *numbers["truth_notes"]):
