@@ -1,6 +1,10 @@
 """One frame of a run, from its sample to what the log says: what recordings and fed data have in common."""
 
+import traceback
+from pathlib import Path
+
 from edslam_ti.datasets import Sample
+from edslam_ti.errors import EdSlamError
 from edslam_ti.journal import Journal
 from edslam_ti.memory import release_free_memory
 from edslam_ti.results.run import Run
@@ -42,3 +46,19 @@ def speed_text(run: Run) -> str:
     if mapper is not None:
         text += f"  {mapper.num_gaussians} Gaussians  loss {mapper.loss:.3f}"
     return text
+
+
+def told(error: Exception, run: Run) -> Exception:
+    """Return an exception to be told in one line; the log gets what shows where it comes from."""
+    if isinstance(error, EdSlamError | OSError):
+        run.note(f"ended by: {error}")
+        return error
+    for line in traceback.format_exception(error):
+        run.note(line.rstrip())
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    told = EdSlamError(
+        f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno}); this is a defect of "
+        "the program, please report it" + ("; log.txt says more" if len(run.slam.trajectory) > 0 else "")
+    )
+    told.__cause__ = error
+    return told

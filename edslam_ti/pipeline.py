@@ -6,7 +6,6 @@ far are saved.
 """
 
 import time
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from edslam_ti.evaluation.lpips import load_lpips
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.frame import FrameBuilder
-from edslam_ti.frame_loop import is_held_out, process_sample, speed_text
+from edslam_ti.frame_loop import is_held_out, process_sample, speed_text, told
 from edslam_ti.identity import compare, identity_of
 from edslam_ti.inspection.calibration import aligned, calibrate_depth
 from edslam_ti.interruption import Interruption, Stopped, signals_handled
@@ -201,7 +200,7 @@ def _run(state: Run, session: _Session) -> None:
         except Stopped:
             pass  # the signal is known, and that it is urgent
         except Exception as error:
-            failure = _told(error, state)
+            failure = told(error, state)
         if len(state.slam.trajectory) > 0:  # else there is nothing to save
             failure = _save(state, session, failure)
     session.viewer.close()
@@ -225,7 +224,7 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
         session.journal.close(state.slam.trajectory)
         save(state, folder.path, console, interruption)
     except Exception as error:
-        failure = failure or _told(error, state)
+        failure = failure or told(error, state)
     try:
         problem = point_latest_to(folder.path)
         if failure is None and not interruption.requested:
@@ -238,22 +237,6 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
         say(console, plain(problem))
     say(console, f"results: {plain(folder.path, 4096)}")
     return failure
-
-
-def _told(error: Exception, state: Run) -> Exception:
-    """Return an exception to be told in one line; the log gets what shows where it comes from."""
-    if isinstance(error, EdSlamError | OSError):
-        state.note(f"ended by: {error}")
-        return error
-    for line in traceback.format_exception(error):
-        state.note(line.rstrip())
-    where = traceback.extract_tb(error.__traceback__)[-1]
-    told = EdSlamError(
-        f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno}); this is a defect of "
-        "the program, please report it" + ("; log.txt says more" if len(state.slam.trajectory) > 0 else "")
-    )
-    told.__cause__ = error
-    return told
 
 
 def open_recording(config: Config, console: Console | None = None) -> EventDepthSequence:

@@ -10,8 +10,8 @@ docs/live.md says which data make a frame, and what becomes of data that come la
 """
 
 import copy
-import math
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ from rich.console import Console
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
 from edslam_ti.errors import DataError, EdSlamError
-from edslam_ti.feeding.cutter import SampleCutter
+from edslam_ti.feeding.inlet import Inlet, is_pose
 from edslam_ti.feeding.intake import DepthUnit, Intake, TimeUnit
-from edslam_ti.feeding.run import NEED_IMAGES, FedRun, SessionResults, check_config
+from edslam_ti.feeding.run import FedRun, SessionResults, check_config
 from edslam_ti.feeding.sequence import FedSequence
 from edslam_ti.interruption import Interruption
 from edslam_ti.kernels import runtime
@@ -38,7 +38,6 @@ from edslam_ti.trajectory import Trajectory
 from edslam_ti.viewer import NoViewer, Viewer
 
 LOOKING_AHEAD = 0.1  # s beyond the last frame over which a pose is predicted; then it stays
-GATHERED = 1.0  # s of data from which the contrast threshold is estimated where none is stated
 MOST_AHEAD = 20_000_000  # events that wait while another thread processes; then `add_events` waits, too
 
 
@@ -73,8 +72,6 @@ class Session:
         """Start the kernels; raises ConfigError for settings that need a recording or its truth."""
         config = config or Config()
         check_config(config)
-        if not (reorder >= 0 and patience >= 0):  # not so for NaN
-            raise DataError(f"reorder, patience: expected seconds from 0 on, got {reorder}, {patience}")
         try:
             runtime.ensure(config.device, config.threads)
         except RuntimeError as error:  # no such device
@@ -83,28 +80,23 @@ class Session:
         # The engine loads its kernels in this thread; other threads may then use them.
         count_events(place, place, one, np.zeros((1, 1, 2), np.int32), np.zeros((1, 1), np.int8))
         self.config = config
-        self._intake = Intake(camera, time_unit, depth_unit, depth_is_undistorted)
-        self.camera = self._intake.pinhole  # undistorted
-        self.counts = self._intake.counts  # of what came, and what was left out
-        needs_images = config.method in NEED_IMAGES
-        self._cutter = SampleCutter(
-            config.max_interval, has_events, needs_images, reorder, patience, self.counts
-        )
-        self._sequence = FedSequence(
-            self.camera, dataset, name, f"{'fed data' if dataset == 'session' else dataset}", has_events
-        )
+        intake = Intake(camera, time_unit, depth_unit, depth_is_undistorted)
+        self.camera = intake.pinhole  # undistorted
+        self.counts = intake.counts  # of what came, and what was left out
+        self._inlet = Inlet(intake, config, has_events, reorder, patience)
+        description = "data of a program" if dataset == "session" else "data of a live source"
+        self._sequence = FedSequence(self.camera, dataset, name, description, has_events)
         self._fed = FedRun(
             self._sequence, config, initial_pose, out, console or Console(quiet=True),
             interruption or Interruption(),
         )  # fmt: skip
-        self._needs_images = needs_images
         self._viewer: Viewer = viewer or NoViewer()
         self._at_once = at_once
-        self._data = threading.Lock()  # streams that wait; held for microseconds
         self._turn = threading.Lock()  # who processes frames
         self._state = threading.RLock()  # tracker and map; held while a frame is processed
         self._shown = Trajectory()  # what readers see; replaced, never changed
         self._results: SessionResults | None = None
+        self.last_tracked: tuple[float, float] | None = None  # time of the newest pose, and when it was known
         self.num_merged = 0  # samples that were merged into the next one
 
     # --- feeding ---
@@ -116,16 +108,13 @@ class Session:
         fit together, and then takes nothing in.
         """
         self._require_open()
-        with self._data:
-            self._cutter.add_events(self._intake.events(x, y, t, p))
+        self._inlet.add_events(x, y, t, p)
         self._process_ready()
 
     def add_depth(self, t: float, depth: Any) -> None:  # [H, W] in the depth unit
         """Add a depth image: z in the events' camera, 0 = missing; None: one was taken but is not usable."""
         self._require_open()
-        with self._data:
-            metres = None if depth is None else self._intake.depth(depth)
-            self._cutter.add_depth(self._intake.second(t), metres)
+        self._inlet.add_depth(t, depth)
         self._process_ready()
 
     def add_image(self, t: float, image: Any) -> None:  # [H, W] grey or [H, W, 3] RGB
@@ -134,21 +123,20 @@ class Session:
         Images measure the map, help to estimate the contrast threshold, and track in RGB-D methods.
         """
         self._require_open()
-        with self._data:
-            self._cutter.add_image(self._intake.second(t), self._intake.image(image))
+        self._inlet.add_image(t, image)
         self._process_ready()
 
     def flush(self, until: float | None = None) -> None:
         """State that all data before a stamp (None: the newest) have been added, and process them."""
         self._require_open()
-        with self._data:
-            self._cutter.flush(self._cutter.newest if until is None else self._intake.second(until))
+        self._inlet.flush(until)
         self._process_ready()
 
     def finish(
         self,
         progress: Callable[[float], bool] | None = None,  # receives 0 to 1; returns False to stop
         metrics: dict[str, Any] | None = None,  # more for metrics.json
+        is_broken_off: bool = False,  # save what there is, without what waits and without refinement
     ) -> SessionResults:
         """Process what waits, refine the map, and write the results if `out` was given; ends the session.
 
@@ -156,24 +144,29 @@ class Session:
         """
         if self._results is not None:
             return self._results
-        with self._data:
-            self._cutter.finish()
-        self._process_ready(is_last=True)
+        if not is_broken_off:
+            self.end_data()
+            self._process_ready(is_last=True)
         with self._state:
             if self._fed.run is None:
                 raise DataError(f"session: expected a depth image and events around it, got {self._received}")
-            self._fed.refine(progress or (lambda fraction: True))
-            self._results = self._fed.save(self.notes, self._numbers() | (metrics or {}))
+            if not is_broken_off:
+                self._fed.refine(progress or (lambda fraction: True))
+            self._results = self._fed.save(self.notes, self._numbers() | (metrics or {}), is_broken_off)
             self._publish()
         self._viewer.close()
         return self._results
+
+    def end_data(self) -> None:
+        """State that all data have been added; `finish` does so, too."""
+        self._inlet.finish()
 
     # --- reading ---
 
     @property
     def time_offset(self) -> float:
         """Seconds to add to the trajectory's stamps to get those that were fed."""
-        return self._intake.time_offset or 0.0
+        return self._inlet.intake.time_offset or 0.0
 
     @property
     def trajectory(self) -> Trajectory:
@@ -183,10 +176,8 @@ class Session:
     @property
     def notes(self) -> list[str]:
         """What was left out, repaired or assumed, a line each."""
-        own = [*self._intake.notes, *self.counts.notes]
-        if self._cutter.gaps_not_divided:
-            own.append(f"{self._cutter.gaps_not_divided} gaps between depth images are longer than a minute")
-        return [*self._sequence.notes, *(line for line in own if line not in self._sequence.notes)]
+        told = self._sequence.notes
+        return [*told, *(line for line in self._inlet.notes if line not in told)]
 
     def pose(self, t: float | None = None) -> np.ndarray | None:  # [4, 4] T_world_camera
         """Return the pose at a stamp (None: the newest that was fed); None before the first frame.
@@ -197,7 +188,7 @@ class Session:
         shown = self._shown
         if len(shown) == 0:
             return None
-        seconds = self._cutter.newest if t is None else self._intake.second(t)
+        seconds = self._inlet.newest if t is None else self._inlet.intake.second(t)
         latest = shown.timestamp(-1) + LOOKING_AHEAD
         return shown.at(min(max(seconds, shown.timestamp(0)), latest))
 
@@ -218,18 +209,16 @@ class Session:
 
     def render(self, pose: np.ndarray, camera: Camera | None = None) -> View:  # [4, 4] T_world_camera
         """Return the map seen from a pose, by the session's own camera or another."""
-        T = np.asarray(pose, np.float64)
-        if T.shape != (4, 4):
-            raise DataError(f"pose: expected a 4x4 matrix, camera to world, got shape {T.shape}")
+        if not is_pose(pose):
+            raise DataError(f"pose: expected a 4x4 matrix, camera to world, got shape {np.shape(pose)}")
         with self._state:
-            return self._mapper.render(camera or self.camera, T)
+            return self._mapper.render(camera or self.camera, np.asarray(pose, np.float64))
 
     # --- frames, for a loop of one's own (at_once=False) ---
 
     def next_times(self) -> list[float]:
-        """Return the times of frames whose data are all there, seconds of the session's clock, in order."""
-        with self._data:
-            return [] if self._begins_later() else self._cutter.next_times()
+        """Return the times of all frames whose data are there, seconds of the session's clock, in order."""
+        return self._inlet.next_times(is_all=True)
 
     def process_next(self, is_mapped: bool = True, merged: int = 1) -> bool:
         """Process the next frame, or several merged into one; return whether there was one.
@@ -254,7 +243,7 @@ class Session:
     @property
     def newest(self) -> float:
         """Newest stamp of all data, seconds of the session's clock."""
-        return self._cutter.newest
+        return self._inlet.newest
 
     @property
     def _mapper(self) -> Mapper:
@@ -278,8 +267,8 @@ class Session:
         """Process all complete frames, unless another thread does; it looks again when it is done."""
         if not self._at_once and not is_last:
             return
-        while self.next_times():
-            must_wait = is_last or self._cutter.queue.number > MOST_AHEAD
+        while self._inlet.next_times():
+            must_wait = is_last or self._inlet.num_waiting > MOST_AHEAD
             if not self._turn.acquire(blocking=must_wait):
                 return
             try:
@@ -289,44 +278,26 @@ class Session:
                 self._turn.release()
 
     def _process_one(self, is_mapped: bool, merged: int) -> bool:
-        with self._data:
-            times = [] if self._begins_later() else self._cutter.next_times()
-            if not times:
-                return False
-            if self._fed.run is None:
-                self._gather(times[0])
-            number = min(merged, len(times)) if self._fed.run is not None else 1
-            cut = self._cutter.cut(number) if self._fed.run is not None else None
+        if not self._inlet.next_times():
+            return False
         with self._state:
-            if cut is None:
-                self._fed.begin(times[0], self._gathered_until, self.time_offset, self._publish)
-                return True
-            self.num_merged += number - 1
-            self._fed.process(cut, is_mapped)
+            if self._fed.run is None:
+                start, end = self._inlet.gather(self._sequence)
+                self._fed.begin(start, end, self.time_offset, self._on_tracked)
+                merged = 1
+            cut = self._inlet.cut(merged)
             run = self._fed.run
-            assert run is not None
+            if cut is None or run is None:
+                return False
+            self.num_merged += cut.num_merged
+            self._fed.process(cut, is_mapped)
             self._publish()
             self._viewer.update(run.slam.trajectory, run.slam.mapper, self.camera)
         return True
 
-    def _begins_later(self) -> bool:
-        """Whether the first frame waits for the data that the contrast threshold is estimated from."""
-        if self._fed.run is not None:
-            return False
-        times, cutter = self._cutter.next_times(), self._cutter
-        if not times or cutter.clock == math.inf:
-            return False
-        if self._needs_images and len(cutter.depths) < 1:
-            return True
-        wants = self.config.contrast_threshold is None and bool(cutter.images)
-        return wants and cutter.clock < times[0] + GATHERED
-
-    def _gather(self, first: float) -> None:
-        """Hand the data so far to the sequence that the method is built from."""
-        cutter = self._cutter
-        self._gathered_until = cutter.newest
-        depth_times = [first, *(time for time, _ in cutter.depths)]
-        self._sequence.gather(cutter.queue.between(-math.inf, math.inf), depth_times, cutter.images)
+    def _on_tracked(self) -> None:
+        self._publish()
+        self.last_tracked = (self._shown.timestamp(-1), time.perf_counter())
 
     def _publish(self) -> None:
         """Show readers the poses as they are now."""

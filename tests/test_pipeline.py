@@ -21,7 +21,7 @@ import yaml
 from rich.console import Console
 from sequences import settings
 
-from edslam_ti import pipeline
+from edslam_ti import frame_loop, pipeline
 from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample, SampledSequence
@@ -311,7 +311,7 @@ def test_free_memory_is_given_back_after_every_mapped_frame(
     is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[int] = []
-    monkeypatch.setattr(pipeline, "release_free_memory", lambda: calls.append(1))
+    monkeypatch.setattr(frame_loop, "release_free_memory", lambda: calls.append(1))
     config = config_for(tiny_folder, tmp_path, duration=0.3, mapping={"enabled": is_mapping})
     assert metrics_of(quiet_run(config))["num_frames"] == 6
     assert len(calls) == expected

@@ -20,10 +20,11 @@ MOST_WAITING = 30_000_000  # events that are kept while a depth image is waited 
 
 @dataclass(frozen=True)
 class Cut:
-    """A sample, and the number (from 0) of the depth image that it ends at; None: it ends between two."""
+    """A sample, how it was cut."""
 
     sample: Sample
-    depth_number: int | None
+    depth_number: int | None  # from 0, of the depth image that it ends at; None: it ends between two
+    num_merged: int = 0  # samples that were merged into it
 
 
 class EventQueue:
@@ -154,13 +155,26 @@ class SampleCutter:
 
     # --- what goes out ---
 
-    def next_times(self) -> list[float]:
-        """Return the times (s) of the samples that can be cut now, those of the next gap at most."""
-        self._plan()
+    def next_times(self, is_all: bool = False) -> list[float]:
+        """Return the times (s) of the samples that can be cut now: to the next depth image, or `is_all`."""
+        if not self._planned and self.previous is None:
+            self._plan_first()
+        while is_all or not self._planned:
+            number, last = len(self._planned), self._planned[-1][0] if self._planned else self.previous
+            if last is not None:
+                self._plan_after(last)
+            if len(self._planned) == number:
+                break
         return [time for time, _, _ in self._planned]
 
     def cut(self, number: int = 1) -> Cut:
-        """Return the next sample of `next_times`, or several as one that ends with the last of them."""
+        """Return the next sample of `next_times`, or up to `number` as one.
+
+        It ends with the last of them that has depth, where one has.
+        """
+        planned = list(self._planned)[:number]
+        ends = [k for k, (_, depth, _) in enumerate(planned) if depth is not None]
+        number = ends[-1] + 1 if ends else len(planned)
         taken = [self._planned.popleft() for _ in range(number)]
         time, depth, is_depth = taken[-1]
         self._num_depths += sum(is_depth for _, _, is_depth in taken)
@@ -171,13 +185,7 @@ class SampleCutter:
         image = self._image_at(time)
         kept = bisect.bisect_left(self.images, time - SAME_MOMENT, key=lambda pair: pair[0])
         self.images = self.images[kept:]
-        return Cut(Sample(time, events, depth, image), self._num_depths - 1 if is_depth else None)
-
-    def _plan(self) -> None:
-        if not self._planned and self.previous is None:
-            self._plan_first()
-        elif not self._planned and self.previous is not None:
-            self._plan_next(self.previous)
+        return Cut(Sample(time, events, depth, image), self._num_depths - 1 if is_depth else None, number - 1)
 
     def _plan_first(self) -> None:
         while self.depths and self._is_known(self.depths[0][0]):
@@ -195,7 +203,7 @@ class SampleCutter:
         if self.queue.number and self.queue.oldest < self._forgotten:
             self.queue.drop_before(self._forgotten)
 
-    def _plan_next(self, previous: float) -> None:
+    def _plan_after(self, previous: float) -> None:
         if self.depths and self._is_known(self.depths[0][0]):
             time, depth = self.depths.pop(0)
             if time - previous > LONGEST_GAP:
@@ -209,7 +217,7 @@ class SampleCutter:
         is_late = self.clock < math.inf and self.clock - previous > self._patience
         self._depth_is_missing |= is_late or self.queue.number > MOST_WAITING
         after = previous + self._max_interval
-        nearest = self.depths[0][0] if self.depths else math.inf
+        nearest = self.depths[0][0] if self.depths else self.newest
         if self._has_events and self._depth_is_missing and after <= min(self.clock, nearest):
             self._planned.append((after, None, False))
 

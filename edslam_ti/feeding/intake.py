@@ -19,6 +19,7 @@ DepthUnit = Literal["m", "cm", "mm"]
 TICKS: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # per second
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 FAR_FROM_OTHERS = 10.0  # s; single stamps this far from the middle of their chunk are damaged
+USUALLY_EARLY = 2  # depth images before the first events are nothing to tell
 LEAST_TO_COMPARE = 3  # events
 
 
@@ -46,7 +47,8 @@ class Counts:
             "depth images came later than the frame they belong to and are left out (a longer `patience` "
             "waits for them)": self.depth_late,
             "depth images repeat a time stamp and are left out": self.depth_repeated,
-            "depth images before the first events are left out": self.depth_early,
+            "depth images before the first events are left out": self.depth_early
+            * (self.depth_early > USUALLY_EARLY),
         }
         return [f"{number} {what}" for what, number in lines.items() if number]
 

@@ -13,6 +13,7 @@ from edslam_ti.config import Config
 from edslam_ti.errors import ConfigError, DataError, plain
 from edslam_ti.event_images.contrast import contrast_threshold
 from edslam_ti.feeding.cutter import Cut
+from edslam_ti.feeding.inlet import is_pose
 from edslam_ti.feeding.sequence import FedSamples, FedSequence
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.frame_loop import is_held_out, process_sample
@@ -21,12 +22,11 @@ from edslam_ti.journal import JOURNAL, Journal
 from edslam_ti.methods import METHODS
 from edslam_ti.results.folder import save
 from edslam_ti.results.run import Run
-from edslam_ti.results.run_folder import INTERRUPTED, RUNNING, SETTINGS, RunFolder, point_latest_to
+from edslam_ti.results.run_folder import FAILED, INTERRUPTED, RUNNING, SETTINGS, RunFolder, point_latest_to
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
 
-NEED_IMAGES = ("open3d_rgbd", "splatam")  # methods that track by grey images
 RECORDINGS_ALONE: dict[str, tuple[Any, str]] = {  # settings, their neutral value, and what to do instead
     "start": (0.0, "feed it the part that it is to use"),
     "duration": (None, "feed it the part that it is to use"),
@@ -76,9 +76,9 @@ class FedRun:
         interruption: Interruption,
     ) -> None:
         self._sequence, self._config = sequence, config
-        self._initial_pose = np.eye(4) if initial_pose is None else np.array(initial_pose, np.float64)
-        if self._initial_pose.shape != (4, 4) or not np.isfinite(self._initial_pose).all():
+        if initial_pose is not None and not is_pose(initial_pose):
             raise DataError("initial_pose: expected a 4x4 matrix, camera to world")
+        self._initial_pose = np.eye(4) if initial_pose is None else np.array(initial_pose, np.float64)
         self._out, self._console, self._interruption = out, console, interruption
         self.run: Run | None = None  # None: nothing has been processed
         self.num_not_mapped = 0  # frames that were tracked alone
@@ -141,13 +141,13 @@ class FedRun:
             run.finish_seconds += time.perf_counter() - started
             run.is_refined = not self._interruption.requested
 
-    def save(self, notes: list[str], metrics: dict[str, Any]) -> SessionResults:
-        """Write the results, where they are asked for, and return them."""
+    def save(self, notes: list[str], metrics: dict[str, Any], is_broken_off: bool) -> SessionResults:
+        """Write the results, where they are asked for, and return them; `is_broken_off`: by a failure."""
         assert self.run is not None, "begin first"
         run, sequence = self.run, self._sequence
         run.held_out = self._samples.held_out
         run.live_metrics = metrics
-        run.is_interrupted = self._interruption.requested
+        run.is_interrupted = self._interruption.requested or is_broken_off
         for line in notes:
             sequence.note(line)
         written: dict[str, Any] = {}
@@ -161,7 +161,7 @@ class FedRun:
                 if problem:
                     sequence.note(problem)
                 if run.is_interrupted:
-                    self._folder.set_state(INTERRUPTED)
+                    self._folder.set_state(FAILED if is_broken_off else INTERRUPTED)
                 else:
                     self._folder.finish()
             finally:
