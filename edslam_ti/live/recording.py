@@ -9,6 +9,7 @@ import numpy as np
 
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, open_folder, open_sequence
+from edslam_ti.datasets.base import MIN_HISTORY, SAME_TIME
 from edslam_ti.datasets.camera_file import CameraFile
 from edslam_ti.errors import ConfigError
 from edslam_ti.live.items import CameraItem, DepthItem, EndItem, EventsItem, ImageItem, Item
@@ -45,11 +46,18 @@ class RecordingSource:
         values = {name: getattr(camera, name) for name in names} | {"pixel_centres": "integer"}
         if sequence.contrast_threshold is not None:
             values["contrast_threshold"] = sequence.contrast_threshold
-        stamps = sequence.depth_timestamps[sequence.depth_timestamps >= self._first]
-        truth = [sequence.true_pose(float(t)) for t in stamps[:1]]
-        return CameraItem(
-            CameraFile.model_validate(values), "s", "m", truth[0] if truth else None, sequence.has_events
+        pose = sequence.true_pose(self._first_frame)
+        return CameraItem(CameraFile.model_validate(values), "s", "m", pose, sequence.has_events)
+
+    @property
+    def _first_frame(self) -> float:
+        """Time (s) of the first usable depth image with enough events before it, as of SampledSequence."""
+        sequence, stamps = self._sequence, self._sequence.depth_timestamps
+        begin = max(sequence.time_range[0], self._first) + (
+            MIN_HISTORY - SAME_TIME if sequence.has_events else 0
         )
+        later = range(int(np.searchsorted(stamps, begin)), len(stamps))
+        return next((float(stamps[k]) for k in later if sequence.depth_or_none(k) is not None), self._first)
 
     def items(self) -> Iterator[Item]:
         """Yield the data in the order of time, each when its time has come."""

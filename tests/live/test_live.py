@@ -317,15 +317,17 @@ class Flood:
 def test_mapping_gives_way_then_frames_are_merged(
     tiny_sequence: EventDepthSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flood = Flood(tiny_sequence)
+    floods = [Flood(tiny_sequence), Flood(tiny_sequence)]
 
     def made(*arguments: Any, **options: Any) -> Session:
-        flood.sessions.insert(0, Session(*arguments, **options))
-        return flood.sessions[0]
+        session = Session(*arguments, **options)
+        for flood in floods:
+            flood.sessions.insert(0, session)
+        return session
 
     monkeypatch.setattr(loop, "Session", made)
     monkeypatch.setattr(loop, "Pressure", lambda: Pressure(-1.0, 1e9))
-    folder, printed = tracked_live(flood, config_for(tmp_path / "a"))
+    folder, printed = tracked_live(floods[0], config_for(tmp_path / "a"))
     metrics = metrics_of(folder)
     not_mapped = metrics["num_frames_not_mapped"]
     assert not_mapped == 14 - 3 - 1  # three are held out anyway, and after the last one there is time
@@ -334,8 +336,8 @@ def test_mapping_gives_way_then_frames_are_merged(
     assert f"{not_mapped} not mapped" in printed
     monkeypatch.setattr(loop, "Pressure", lambda: Pressure(-1.0, -1.0))
     monkeypatch.setattr(loop, "MOST_MERGED", 2)
-    flood.sessions.clear()
-    folder, _ = tracked_live(flood, config_for(tmp_path / "b"), patience=5.0)
+    floods[1].sessions.clear()
+    folder, _ = tracked_live(floods[1], config_for(tmp_path / "b"), patience=5.0)
     metrics = metrics_of(folder)
     assert metrics["num_frames"] + metrics["num_frames_merged"] == 14
     assert metrics["num_frames_merged"] >= 4
