@@ -102,15 +102,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "feeding": ["intake", "cutter", "sequence", "inlet", "run"],
     "live": [
-        "items",
-        "messages",
-        "addresses",
-        "recording",
-        "connections",
-        "folder",
-        "client",
-        "warm_up",
-        "loop",
+        *("items", "messages", "addresses", "recording", "connections", "folder", "cameras", "client"),
+        *("warm_up", "loop"),
     ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),

@@ -10,7 +10,7 @@ Messages, directories and drivers are described in docs/live.md.
     edslam live --listen unix:/tmp/slam.sock
     edslam live --listen -                             messages from standard input
     edslam live --folder incoming                      files that another process renames into a folder
-    edslam live --camera neuromorphic --depth-camera realsense
+    edslam live --camera neuromorphic --depth-camera realsense --calibration camera.json
 
 Ctrl-C ends the data, then refines and saves. Exit codes: as for `edslam slam`.
 """
@@ -115,6 +115,8 @@ def read_live_options(argv: Sequence[str] | None) -> tuple[LiveOptions, Config]:
         raise UsageError("--send and --to: expected both or neither; give the missing one")
     if (options.depth_camera or options.calibration) and options.camera is None:
         raise UsageError("--depth-camera, --calibration: expected with --camera")
+    if options.camera is not None and options.calibration is None:
+        raise UsageError("--camera: expected --calibration CAMERA.json with it")
     return options, config
 
 
@@ -146,7 +148,15 @@ def _source(options: LiveOptions, config: Config, tell: Callable[[str], None]) -
         from edslam_ti.live.folder import FolderSource
 
         return FolderSource(options.folder)
-    raise UsageError("--camera: not there yet")
+    from edslam_ti.kernels import runtime
+    from edslam_ti.live.cameras import CameraSource, RealsenseDepth, load_driver
+
+    assert options.calibration is not None, "checked above"
+    tell("warning: camera drivers are written by their documentation and not tried with hardware")
+    runtime.ensure(config.device, config.threads)  # depth is drawn into the event camera
+    events_driver = load_driver("neuromorphic_drivers")
+    depth = RealsenseDepth(load_driver("pyrealsense2")) if options.depth_camera is not None else None
+    return CameraSource(options.calibration, events_driver, depth)
 
 
 def _send(name: str, to: str, pace: float, config: Config, tell: Callable[[str], None]) -> None:

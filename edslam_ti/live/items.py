@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from edslam_ti.datasets.camera_file import CameraFile
+from edslam_ti.depth_reprojection import DepthReprojection
 from edslam_ti.errors import DataError
 from edslam_ti.feeding.intake import DepthUnit, TimeUnit
 
@@ -25,6 +26,7 @@ class CameraItem:
     depth_unit: DepthUnit = "m"
     initial_pose: np.ndarray | None = None  # [4, 4] T_world_camera of the first frame; None: the identity
     has_events: bool = True
+    reprojection: DepthReprojection | None = None  # of depth in another camera; None: pixel for pixel
 
     def is_same(self, other: "CameraItem") -> bool:
         """Return whether data of both belong to one session; a new first pose makes no difference."""

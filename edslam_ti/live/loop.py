@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from edslam_ti.config import Config
+from edslam_ti.depth_reprojection import DepthReprojection
 from edslam_ti.errors import DataError, plain
 from edslam_ti.feeding.run import check_config
 from edslam_ti.frame_loop import speed_text, told
@@ -86,6 +87,7 @@ class LiveRun:
         self._source, self._config, self._console = source, config, console
         self._interruption, self._make_session = interruption, make_session
         self._pressure = pressure
+        self._reprojection: DepthReprojection | None = None
         self._latencies: deque[float] = deque(maxlen=MOST_LATENCIES)  # seconds
         self._newest, self._complete = Milestones(), Milestones()
         self._inbox = Inbox()
@@ -133,14 +135,14 @@ class LiveRun:
 
     def _take_in(self, item: Item, came: float) -> None:
         if isinstance(item, CameraItem):
-            self.session = self._make_session(item)
+            self.session, self._reprojection = self._make_session(item), item.reprojection
         elif isinstance(item, NoteItem):
             self._tell(item.text)
         elif isinstance(item, EndItem):
             self._is_ended = True
         elif self.session is not None:
             try:
-                feed(self.session, item)
+                feed(self.session, item, self._reprojection)
             except DataError as error:
                 self._tell(f"left out: {plain(error)}")
             self._newest.note(self.session.newest, came)
@@ -175,12 +177,15 @@ class LiveRun:
         return text + (f"  {lost} of the last 20 lost" if lost else "")
 
 
-def feed(session: Session, item: Item) -> None:
-    """Hand an item's data to a session."""
+def feed(session: Session, item: Item, reprojection: DepthReprojection | None) -> None:
+    """Hand an item's data to a session; `reprojection`: depth is another camera's."""
     if isinstance(item, EventsItem):
         session.add_events(item.x, item.y, item.t, item.p)
     elif isinstance(item, DepthItem):
-        session.add_depth(item.t, item.depth)
+        depth = item.depth
+        if reprojection is not None and depth is not None:
+            depth = reprojection(depth)
+        session.add_depth(item.t, depth)
     elif isinstance(item, ImageItem):
         session.add_image(item.t, item.image)
     elif isinstance(item, TimeItem):
