@@ -21,7 +21,7 @@ from rich.console import Console
 
 from edslam_ti.camera import Camera
 from edslam_ti.config import Config
-from edslam_ti.errors import DataError, EdSlamError
+from edslam_ti.errors import DataError, EdSlamError, plain
 from edslam_ti.feeding.inlet import Inlet, is_pose
 from edslam_ti.feeding.intake import DepthUnit, Intake, TimeUnit
 from edslam_ti.feeding.run import FedRun, SessionResults, check_config
@@ -70,7 +70,9 @@ class Session:
         interruption: Interruption | None = None,
     ) -> None:
         """Start the kernels; raises ConfigError for settings that need a recording or its truth."""
-        config = config or Config()
+        if not name or Path(name).name != name:
+            raise DataError(f"name: expected one that a folder can have, got '{plain(name)}'")
+        config = (config or Config()).updated({"scene": name, "dataset": None})
         check_config(config)
         try:
             runtime.ensure(config.device, config.threads)
@@ -148,7 +150,7 @@ class Session:
             self.end_data()
             self._process_ready(is_last=True)
         with self._state:
-            if self._fed.run is None:
+            if self._fed.is_empty:
                 raise DataError(f"session: expected a depth image and events around it, got {self._received}")
             if not is_broken_off:
                 self._fed.refine(progress or (lambda fraction: True))

@@ -23,7 +23,7 @@ def main(scene: str = "office0", data_dir: Path = Path("data"), out: Path = Path
     session = edslam_ti.Session(sequence.camera, config, out=out, name=scene)
     first, last = sequence.time_range
     depth_times = list(sequence.depth_timestamps)
-    for start in np.arange(first, min(last, first + 0.6), PIECE):
+    for start in np.arange(first, min(last, first + 0.4), PIECE):
         events = sequence.events(start, start + PIECE)
         session.add_events(events.x, events.y, events.t, events.polarity)
         while depth_times and depth_times[0] < start + PIECE:

@@ -19,12 +19,12 @@ SPEED, DISTANCE, THRESHOLD = 0.2, 1.5, 0.1  # m/s, m, of log brightness
 
 
 def stream(seconds: float) -> Iterator[tuple[float, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield a time (s) and the columns, rows and signs of the events of every half millisecond."""
+    """Yield a time (s) and the columns, rows and signs of the events of every millisecond."""
     tiles = np.random.default_rng(0).uniform(0.1, 0.9, (24, 48))
     wall = cv2.GaussianBlur(cv2.resize(tiles, (480, 240), interpolation=cv2.INTER_NEAREST), None, 1.0)
     xs, ys = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(120, dtype=np.float32))
     last = None
-    for t in np.arange(0, seconds, 0.0005):
+    for t in np.arange(0, seconds, 0.001):
         shift = np.float32(CAMERA.fx * SPEED * t / DISTANCE)  # pixels
         image = np.log(cv2.remap(wall, 100 + xs + shift, 50 + ys, cv2.INTER_LINEAR))
         last = image.copy() if last is None else last
@@ -41,7 +41,7 @@ def main(picture: Path = Path("growing_map.png"), seconds: float = 0.6) -> np.nd
     views, random, shown = [], np.random.default_rng(1), 0
     for k, (t, x, y, sign) in enumerate(stream(seconds)):
         session.add_events(x, y, np.full(len(x), t), sign)
-        if k % 100 == 0:  # at 20 Hz
+        if k % 50 == 0:  # at 20 Hz
             session.add_depth(t, random.normal(DISTANCE, 0.002, CAMERA.shape))
         if len(session.trajectory) >= shown + 5:
             shown = len(session.trajectory)

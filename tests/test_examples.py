@@ -66,7 +66,7 @@ def test_a_map_is_rendered_from_a_new_pose(result: Path, tmp_path: Path) -> None
 
 def test_a_session_in_a_loop(tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = example(4)(tiny_folder.name, tiny_folder.parent, tmp_path)
-    assert len(read_tum(folder / "trajectory_tum.txt")) > 8
+    assert len(read_tum(folder / "trajectory_tum.txt")) > 5
     assert (folder / "map.ply").is_file()
     assert "0.30 s: camera at [" in capsys.readouterr().out
 

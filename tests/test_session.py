@@ -128,7 +128,7 @@ def test_sample_by_sample_is_the_run_to_the_bit(
     assert len(expected) > len(slow_depth.depth_timestamps)  # there are frames without depth
 
 
-@pytest.mark.parametrize("largest", [40, 3000, 10**6])
+@pytest.mark.parametrize("largest", [40, 3000])
 def test_random_chunks_are_the_run_to_the_bit(
     largest: int, slow_depth: EventReplicaSequence, expected: Trajectory
 ) -> None:
@@ -139,8 +139,6 @@ def test_all_of_one_stream_before_the_other_is_the_run_to_the_bit(
     slow_depth: EventReplicaSequence, expected: Trajectory
 ) -> None:
     depth = [(t, slow_depth.depth(k)) for k, t in enumerate(slow_depth.depth_timestamps)]
-    session = feed(session_for(slow_depth), [*depth, (0, *all_events(slow_depth))])
-    assert_same(session.finish().trajectory, expected)
     session = feed(session_for(slow_depth), [(0, *all_events(slow_depth)), *depth])
     assert_same(session.finish().trajectory, expected)
 
@@ -364,8 +362,21 @@ def test_results_have_the_layout_of_a_run(slow_depth: EventReplicaSequence, tmp_
     assert metrics["psnr_corrected_db"] > 15
     assert (metrics["num_late_events"], metrics["num_frames_merged"]) == (0, 0)
     assert json.loads((results.folder / "run.json").read_text())["state"] == "finished"
+    assert "scene: mine\n" in (results.folder / "config.yaml").read_text()
     with pytest.raises(DataError, match="finished"):
         session.flush()
+
+
+def test_a_session_that_was_cut_off_cannot_be_resumed(
+    slow_depth: EventReplicaSequence, tmp_path: Path
+) -> None:
+    tracked = config_with(mapping={"enabled": False})
+    feed(session_for(slow_depth, tracked, out=tmp_path), list(in_chunks(slow_depth, 2000))[:12])
+    [folder] = (tmp_path / "session/session/ed_slam").iterdir()
+    assert len((folder / "journal.csv").read_text().splitlines()) > 2
+    (folder / ".lock").unlink()  # as if the process had ended
+    with pytest.raises(DataError, match="data of a session cannot be read again"):
+        pipeline.resume(folder, tracked)
 
 
 def test_threshold_is_estimated_from_the_first_images(slow_depth: EventReplicaSequence) -> None:

@@ -22,7 +22,15 @@ from edslam_ti.journal import JOURNAL, Journal
 from edslam_ti.methods import METHODS
 from edslam_ti.results.folder import save
 from edslam_ti.results.run import Run
-from edslam_ti.results.run_folder import FAILED, INTERRUPTED, RUNNING, SETTINGS, RunFolder, point_latest_to
+from edslam_ti.results.run_folder import (
+    FAILED,
+    FED,
+    INTERRUPTED,
+    RUNNING,
+    SETTINGS,
+    RunFolder,
+    point_latest_to,
+)
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.tracker import TrackingResult
 from edslam_ti.trajectory import Trajectory
@@ -109,6 +117,7 @@ class FedRun:
             sequence.note(f"contrast threshold {contrast.value:.3g} {source}: the settings state none")
         if self._out is not None:
             self._folder = RunFolder.make(self._out / sequence.dataset / sequence.scene / config.method)
+            self._folder.identity = {FED: True}  # its data cannot be read again
             self._folder.write(SETTINGS, config.to_yaml())
             self._folder.set_state(RUNNING)
             self._journal = Journal(self._folder.path / JOURNAL, time_offset)
@@ -131,6 +140,15 @@ class FedRun:
         if problem:
             run.note(f"frame {k} at {sample.timestamp:.3f} s: {problem}")
         return process_sample(run, sample, self._journal, problem)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frame has been tracked; a folder that was made is removed then."""
+        if self.run is not None and len(self.run.slam.trajectory) > 0:
+            return False
+        if self._folder is not None:
+            self._folder.discard()
+        return True
 
     def refine(self, progress: Callable[[float], bool]) -> None:
         """Refine the map over all that is kept."""

@@ -42,7 +42,7 @@ from edslam_ti.viewer import Viewer
 POLL = 0.05  # seconds between two looks at signals while nothing comes
 MOST_MERGED = 4  # frames that become one: 0.2 s of motion between two poses
 # Settings that say which part of a recording is played.
-NOT_THE_SESSION: dict[str, Any] = {"dataset": None, "start": 0.0, "duration": None, "depth_dir": None}
+NOT_THE_SESSION: dict[str, Any] = {"start": 0.0, "duration": None, "depth_dir": None}
 MOST_LATENCIES = 200_000  # of frames, from which the median is taken: hours
 
 
@@ -229,7 +229,7 @@ def run_live(
         say(console, f"camera {size}, results in {plain(config.out, 4096)}")
         return Session(
             lens if lens.is_distorted else lens.pinhole,
-            own.updated(NOT_THE_SESSION | {"scene": settings.name}),
+            own.updated(NOT_THE_SESSION),
             time_unit=camera.time_unit,
             depth_unit=camera.depth_unit,
             depth_is_undistorted=camera.file.depth_undistorted,

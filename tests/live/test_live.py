@@ -74,7 +74,7 @@ def test_a_recording_without_a_pace_is_the_run_to_the_bit(
     tiny_sequence: EventDepthSequence, tmp_path: Path
 ) -> None:
     samples = SampledSequence(tiny_sequence, 0.0, None, 0.05)
-    config = config_for(tmp_path, contrast_threshold=0.1)
+    config = config_for(tmp_path, contrast_threshold=0.1, mapping={"enabled": False})
     session = Session(tiny_sequence.camera, config, initial_pose=samples[0].T_world_camera)
     for sample in samples:
         events = sample.events
@@ -151,7 +151,8 @@ def test_a_second_process_sends_is_killed_and_comes_back(
 
     source.items = items  # type: ignore[method-assign]
     thread.start()
-    folder, printed = tracked_live(source, config_for(tmp_path / "out"))
+    config = config_for(tmp_path / "out", mapping={"enabled": False})
+    folder, printed = tracked_live(source, config)
     thread.join()
     assert killed.is_set()
     assert "client 1 has gone; waiting for another" in printed
@@ -183,7 +184,8 @@ def test_malformed_messages_close_the_connection_and_the_session_goes_on(
 
     thread = threading.Thread(target=send)
     thread.start()
-    folder, printed = tracked_live(source, config_for(tmp_path), keeps_up=False)
+    config = config_for(tmp_path, mapping={"enabled": False})
+    folder, printed = tracked_live(source, config, keeps_up=False)
     thread.join()
     assert "client 1: connection closed: expected a message that begins with b'EDSL'" in printed
     assert "client 2: connection closed: the stream ends within a header" in printed
@@ -337,7 +339,8 @@ def test_mapping_gives_way_then_frames_are_merged(
     monkeypatch.setattr(loop, "Pressure", lambda: Pressure(-1.0, -1.0))
     monkeypatch.setattr(loop, "MOST_MERGED", 2)
     floods[1].sessions.clear()
-    folder, _ = tracked_live(floods[1], config_for(tmp_path / "b"), patience=5.0)
+    config = config_for(tmp_path / "b", mapping={"enabled": False})
+    folder, _ = tracked_live(floods[1], config, patience=5.0)
     metrics = metrics_of(folder)
     assert metrics["num_frames"] + metrics["num_frames_merged"] == 14
     assert metrics["num_frames_merged"] >= 4
