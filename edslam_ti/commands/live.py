@@ -161,13 +161,19 @@ def _source(options: LiveOptions, config: Config, tell: Callable[[str], None]) -
 
 def _send(name: str, to: str, pace: float, config: Config, tell: Callable[[str], None]) -> None:
     """Send a recording to a session."""
+    from rich.progress import TimeRemainingColumn
+
     from edslam_ti.kernels import runtime
     from edslam_ti.live.addresses import address_of
     from edslam_ti.live.client import send_all
     from edslam_ti.live.recording import RecordingSource, open_named
+    from edslam_ti.patient_console import patient_console, progress_bar
 
     address = address_of(to)
     runtime.ensure(config.device, config.threads)  # a built-in room is made on first use
     source = RecordingSource(open_named(name, config), pace, config.start, config.duration)
     tell(f"sending {source.description} to {address}")
-    tell(f"{send_all(source, address)} messages sent")
+    with progress_bar(patient_console(), TimeRemainingColumn()) as bar:
+        task = bar.add_task("sending", total=round(1000 * source.seconds), status="ms of the recording")
+        number = send_all(source, address, lambda seconds: bar.update(task, completed=round(1000 * seconds)))
+    tell(f"{number} messages sent")

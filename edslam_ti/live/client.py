@@ -12,8 +12,9 @@ from typing import Self
 
 from edslam_ti.errors import DataError
 from edslam_ti.live.addresses import Address, address_of
-from edslam_ti.live.items import CameraItem, EndItem, EventsItem, Item, Source
+from edslam_ti.live.items import CameraItem, DepthItem, EventsItem, Item
 from edslam_ti.live.messages import MOST_EVENTS, encoded
+from edslam_ti.live.recording import RecordingSource
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.05, 1.0  # seconds between two tries to connect
 
@@ -71,11 +72,11 @@ class Client:
 
 
 def send_all(
-    source: Source,
+    source: RecordingSource,
     address: Address,
-    report: Callable[[Item], None] = lambda item: None,
+    report: Callable[[float], None] = lambda seconds: None,  # receives how far the recording has been sent
 ) -> int:
-    """Send all that a source yields, its end too; return the number of messages."""
+    """Send a recording, its end too; return the number of messages."""
     number, client = 0, None
     try:
         for item in source.items():
@@ -84,9 +85,8 @@ def send_all(
             elif client is not None:
                 client.send(item)
             number += 1
-            report(item)
-            if isinstance(item, EndItem):
-                break
+            if isinstance(item, DepthItem):
+                report(item.t - source.first)
     finally:
         source.close()
         if client is not None:

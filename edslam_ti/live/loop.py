@@ -103,10 +103,12 @@ class LiveRun:
             try:
                 while not self._interruption.requested:
                     has_frames = self.session is not None and bool(self.session.next_times())
-                    items = self._inbox.take(0.0 if has_frames else POLL)
+                    # Without pressure, frames come first: what is not taken in keeps the source waiting.
+                    is_first = has_frames and self._pressure is None
+                    items = [] if is_first else self._inbox.take(0.0 if has_frames else POLL)
                     for item, came in items:
                         self._take_in(item, came)
-                    if self._is_ended or (self._inbox.is_ended and not items):
+                    if self._is_ended or (self._inbox.is_ended and not items and not is_first):
                         break
                     if has_frames and self.session is not None:
                         self._process(self.session)

@@ -32,11 +32,16 @@ class RecordingSource:
         self.description = f"{sequence.scene}, played{f' at {pace:g} times its pace' if pace else ''}"
         self.is_live = pace > 0
         first, last = sequence.time_range
-        self._first = min([first, *sequence.depth_timestamps[:1]]) + start
-        self._last = np.nextafter(last, np.inf) if duration is None else self._first + duration
+        self.first = min([first, *sequence.depth_timestamps[:1]]) + start
+        self._last = np.nextafter(last, np.inf) if duration is None else self.first + duration
         if duration is None and len(sequence.depth_timestamps):
             self._last = max(self._last, np.nextafter(float(sequence.depth_timestamps[-1]), np.inf))
         self._closed = threading.Event()
+
+    @property
+    def seconds(self) -> float:
+        """Length of what is played."""
+        return float(self._last - self.first)
 
     @property
     def camera(self) -> CameraItem:
@@ -53,11 +58,11 @@ class RecordingSource:
     def _first_frame(self) -> float:
         """Time (s) of the first usable depth image with enough events before it, as of SampledSequence."""
         sequence, stamps = self._sequence, self._sequence.depth_timestamps
-        begin = max(sequence.time_range[0], self._first) + (
+        begin = max(sequence.time_range[0], self.first) + (
             MIN_HISTORY - SAME_TIME if sequence.has_events else 0
         )
         later = range(int(np.searchsorted(stamps, begin)), len(stamps))
-        return next((float(stamps[k]) for k in later if sequence.depth_or_none(k) is not None), self._first)
+        return next((float(stamps[k]) for k in later if sequence.depth_or_none(k) is not None), self.first)
 
     def items(self) -> Iterator[Item]:
         """Yield the data in the order of time, each when its time has come."""
@@ -65,7 +70,7 @@ class RecordingSource:
         yield self.camera
         for time_, item in self._timed():
             if self._pace:
-                due = began + (time_ - self._first) / self._pace
+                due = began + (time_ - self.first) / self._pace
                 if self._closed.wait(max(0.0, due - self._clock())):
                     return
             elif self._closed.is_set():
@@ -80,8 +85,8 @@ class RecordingSource:
         """Yield items and when they are complete, seconds."""
         sequence = self._sequence
         stamps, pictures = sequence.depth_timestamps, sequence.image_timestamps
-        edges = np.arange(self._first, self._last + PIECE, PIECE)
-        depth, image = (int(np.searchsorted(s, self._first)) for s in (stamps, pictures))
+        edges = np.arange(self.first, self._last + PIECE, PIECE)
+        depth, image = (int(np.searchsorted(s, self.first)) for s in (stamps, pictures))
         for start, end in zip(edges, np.minimum(edges[1:], self._last)):
             events = sequence.events(float(start), float(end)) if sequence.has_events else None
             if events is not None and len(events):

@@ -365,6 +365,23 @@ def test_an_inbox_is_bounded() -> None:
     assert not inbox.put(TimeItem(1))
 
 
+def test_a_source_waits_where_every_frame_is_mapped(
+    tiny_sequence: EventDepthSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting: list[float] = []
+
+    class Watched(Session):
+        def process_next(self, is_mapped: bool = True, merged: int = 1) -> bool:
+            waiting.append(self.newest - self.next_times()[0])
+            return super().process_next(is_mapped, merged)
+
+    monkeypatch.setattr(loop, "Session", Watched)
+    monkeypatch.setattr(loop, "Inbox", lambda: Inbox(most=20_000))
+    config = config_for(tmp_path, mapping={"enabled": False})
+    tracked_live(RecordingSource(tiny_sequence, pace=0.0), config)
+    assert max(waiting) < 0.1  # seconds of data in the session, however fast they can be read
+
+
 def test_milestones() -> None:
     milestones = Milestones()
     for stamp, moment in ((0.1, 10.0), (0.1, 11.0), (0.3, 12.0)):
