@@ -5,6 +5,7 @@ The public names load on demand: `import edslam_ti` loads neither torch nor Taic
     config = edslam_ti.Config(scene="office0", duration=0.6)
     folder = edslam_ti.run(config)                                # what `edslam slam` does
     gaussians = edslam_ti.load_map(folder / "map.ply")            # a GaussianMap
+    session = edslam_ti.Session(camera, config)                   # fed with arrays as they come, docs/live.md
 """
 
 import importlib
@@ -16,15 +17,17 @@ if TYPE_CHECKING:
     from edslam_ti.mapping.gaussians import GaussianMap
     from edslam_ti.pipeline import run
     from edslam_ti.results.maps import load_map
+    from edslam_ti.session import Session
     from edslam_ti.slam import Slam
 
 __version__ = "0.1.0"
 
-__all__ = ["Config", "GaussianMap", "Slam", "__version__", "load_map", "open_sequence", "run"]
+__all__ = ["Config", "GaussianMap", "Session", "Slam", "__version__", "load_map", "open_sequence", "run"]
 
 _HOMES = {
     "Config": "config",
     "GaussianMap": "mapping.gaussians",
+    "Session": "session",
     "Slam": "slam",
     "load_map": "results.maps",
     "open_sequence": "datasets",

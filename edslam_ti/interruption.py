@@ -39,6 +39,15 @@ class Interruption:
         """Whether a signal has come."""
         return self.number is not None
 
+    @property
+    def is_ctrl_c_once(self) -> bool:
+        """Whether all that has come is one Ctrl-C."""
+        return self.number == signal.SIGINT and self._count == 1
+
+    def forgive(self) -> None:
+        """Forget the signals so far: they have been obeyed."""
+        self.number, self.is_urgent, self._count = None, False, 0
+
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Take in a signal (as a handler of `signal.signal`)."""
         self._count += 1

@@ -6,7 +6,6 @@ far are saved.
 """
 
 import time
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +23,14 @@ from edslam_ti.errors import DataError, EdSlamError, plain
 from edslam_ti.evaluation.lpips import load_lpips
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
+from edslam_ti.event_images.sensor import SensorEstimate, estimate_sensor
 from edslam_ti.frame import FrameBuilder
+from edslam_ti.frame_loop import is_held_out, process_sample, speed_text, told
 from edslam_ti.identity import compare, identity_of
 from edslam_ti.inspection.calibration import aligned, calibrate_depth
 from edslam_ti.interruption import Interruption, Stopped, signals_handled
 from edslam_ti.journal import JOURNAL, Journal
 from edslam_ti.mapping.mapper import Mapper
-from edslam_ti.memory import release_free_memory
 from edslam_ti.mesh_reading import read_triangle_mesh
 from edslam_ti.methods import METHODS
 from edslam_ti.patient_console import patient_console, progress_bar, say
@@ -148,7 +148,7 @@ def _prepare(config: Config, console: Console, open_with: Opener) -> tuple[Viewe
     for text in contrast.notes:
         sequence.note(text)
     held_out = held_out_frames(samples, config.evaluation.hold_out_every)
-    state = Run(config, sequence, samples, slam, held_out, contrast)
+    state = Run(config, sequence, samples, slam, held_out, contrast, sensor_of(sequence, samples))
     camera, (first, last) = sequence.camera, samples.timestamps[[0, -1]]
     scene, description = plain(sequence.scene), plain(sequence.description)
     state.note(f"{scene}: {description}, method {config.method}")
@@ -201,7 +201,7 @@ def _run(state: Run, session: _Session) -> None:
         except Stopped:
             pass  # the signal is known, and that it is urgent
         except Exception as error:
-            failure = _told(error, state)
+            failure = told(error, state)
         if len(state.slam.trajectory) > 0:  # else there is nothing to save
             failure = _save(state, session, failure)
     session.viewer.close()
@@ -225,7 +225,7 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
         session.journal.close(state.slam.trajectory)
         save(state, folder.path, console, interruption)
     except Exception as error:
-        failure = failure or _told(error, state)
+        failure = failure or told(error, state)
     try:
         problem = point_latest_to(folder.path)
         if failure is None and not interruption.requested:
@@ -238,22 +238,6 @@ def _save(state: Run, session: _Session, failure: Exception | None) -> Exception
         say(console, plain(problem))
     say(console, f"results: {plain(folder.path, 4096)}")
     return failure
-
-
-def _told(error: Exception, state: Run) -> Exception:
-    """Return an exception to be told in one line; the log gets what shows where it comes from."""
-    if isinstance(error, EdSlamError | OSError):
-        state.note(f"ended by: {error}")
-        return error
-    for line in traceback.format_exception(error):
-        state.note(line.rstrip())
-    where = traceback.extract_tb(error.__traceback__)[-1]
-    told = EdSlamError(
-        f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno}); this is a defect of "
-        "the program, please report it" + ("; log.txt says more" if len(state.slam.trajectory) > 0 else "")
-    )
-    told.__cause__ = error
-    return told
 
 
 def open_recording(config: Config, console: Console | None = None) -> EventDepthSequence:
@@ -293,10 +277,22 @@ def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSe
     return contrast_threshold(config.contrast_threshold, sequence, first, last)
 
 
+def sensor_of(sequence: EventDepthSequence, samples: SampledSequence) -> SensorEstimate | None:
+    """Return what the events of a run tell about their sensor; None where they cannot be read that far."""
+    if not sequence.has_events:
+        return None
+    first, last = (float(t) for t in samples.timestamps[[0, -1]])
+    try:
+        return estimate_sensor(sequence, first, last)
+    except (DataError, OSError) as error:
+        sequence.note(f"the event sensor is not examined: {error}")
+        return None
+
+
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:
     """Return the indices of every n-th frame with depth, from the middle of the first n on."""
     with_depth = np.nonzero(samples.has_depth)[0]
-    return {int(k) for k in with_depth[every // 2 :: every]}
+    return {int(k) for number, k in enumerate(with_depth) if is_held_out(number, every)}
 
 
 # --- the loop ---
@@ -305,43 +301,28 @@ def held_out_frames(samples: SampledSequence, every: int) -> set[int]:
 def _process(state: Run, session: _Session) -> None:
     """Process the frames that have not been processed yet, until a signal comes."""
     slam, mapper = state.slam, state.slam.mapper
-    num_unreadable = 0  # in a row
+    samples, num_unreadable = state.samples, 0  # in a row
+    assert isinstance(samples, SampledSequence)  # others have been fed
     with progress_bar(session.console, TimeRemainingColumn()) as bar:
-        first, total = len(slam.results), len(state.samples)
+        first, total = len(slam.results), len(samples)
         task = bar.add_task("mapping" if mapper else "tracking", total=total, completed=first, status="")
         ate, error = "", None
         for k in range(first, total):
             if session.interruption.requested:
                 break
-            sample, problem = state.samples.as_far_as_readable(k)
-            if not problem and state.samples.has_depth[k] and sample.depth is None:
+            sample, problem = samples.as_far_as_readable(k)
+            if not problem and samples.has_depth[k] and sample.depth is None:
                 problem = "its depth image cannot be used"
             if problem:
                 state.note(f"frame {k} at {sample.timestamp:.3f} s: {problem}")
             num_unreadable = num_unreadable + 1 if problem else 0
             if num_unreadable >= MOST_UNREADABLE:
                 raise DataError(f"{num_unreadable} frames in a row cannot be read; the last: {problem}")
-            # With true poses, a frame where the truth has a hole is kept from the map.
-            has_no_pose = state.config.poses == "truth" and sample.T_world_camera is None
-            result = slam.process(sample, is_held_out=has_no_pose or k in state.held_out)
-            if mapper is not None:
-                release_free_memory()  # arrays of ever other sizes come and go while mapping
-            state.num_events += len(sample.events)
-            if not result.converged:
-                state.note(f"frame {k} at {sample.timestamp:.3f} s lost: {result.message}")
-            elif result.message:
-                state.note(f"frame {k} at {sample.timestamp:.3f} s: {result.message}")
-            session.journal.add(slam.trajectory, result.converged, result.message or problem)
-            if session.journal.problem:
-                state.note_once(f"the journal cannot be written: {session.journal.problem}")
+            process_sample(state, sample, session.journal, problem)
             if k % ATE_EVERY == 0 and state.sequence.truth is not None:
                 error = ate_rmse_cm(slam.trajectory, state.sequence.truth)
                 ate = "" if error is None else f"  ATE {error:.2f} cm"
-            hertz = len(slam.results) / (slam.tracking_seconds + slam.mapping_seconds)
-            status = f"{hertz:.1f} Hz"
-            if mapper is not None:
-                status += f"  {mapper.num_gaussians} Gaussians  loss {mapper.loss:.3f}"
-            bar.update(task, advance=1, status=status + ate)
+            bar.update(task, advance=1, status=speed_text(state) + ate)
             session.keeper.keep_if_due()
             _show(state, session, sample, error)
 

@@ -1,6 +1,7 @@
 """ED-SLAM as in Fig. 1 of the paper: events and depth in, trajectory and map out."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ class Slam:
         self.results: list[TrackingResult] = []
         self.tracking_seconds = 0.0
         self.mapping_seconds = 0.0
+        self.on_tracked: Callable[[], None] | None = None  # called when a pose is known, before it is mapped
 
     @property
     def frontend_trajectory(self) -> Trajectory:
@@ -43,6 +45,8 @@ class Slam:
         self.trajectory.append(frame.timestamp, result.T_world_camera)
         self.results.append(replace(result, corrections={}))  # the trajectory holds them
         tracked = time.perf_counter()
+        if self.on_tracked is not None:
+            self.on_tracked()
         if self.mapper is not None:
             if len(self.results) - 1 in result.distrusted:
                 frame = replace(frame, depth=None)

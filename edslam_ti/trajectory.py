@@ -52,6 +52,12 @@ class Trajectory:
         """Return pose `index`; negative indices count from the end."""
         return self._poses[index]
 
+    def snapshot(self) -> "Trajectory":
+        """Return a copy that later changes do not reach; it shares the poses, which are never changed."""
+        copy = Trajectory()
+        copy._timestamps, copy._poses = list(self._timestamps), list(self._poses)
+        return copy
+
     def index_of(self, timestamp: float) -> int:
         """Return the index of the last pose at or before a time; -1: there is none."""
         return bisect.bisect_right(self._timestamps, timestamp) - 1

@@ -10,6 +10,7 @@ import torch
 from edslam_ti.kernels import compiled_cache
 from edslam_ti.kernels.engine import ENGINE, ti, with_home
 
+_running: tuple[str, str, int] | None = None  # device, precision and threads of the engine
 CHUNK = 512  # Taichi's CPU backend never splits a loop into pieces smaller than this
 
 
@@ -31,6 +32,14 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int = 2, debug: boo
     actual = ti.cfg.arch
     if (actual == ti.cuda) != (arch == "cuda"):
         raise RuntimeError(f"{arch}: Taichi started on {actual} instead; use --device cpu")
+    global _running
+    _running = (arch, precision, threads)
+
+
+def ensure(arch: str = "cpu", threads: int = 2) -> None:
+    """Start Taichi unless it runs like this already: a restart would compile every kernel again."""
+    if _running != (arch, "f32", threads):
+        init(arch, threads=threads)
 
 
 def _start(arch: str, precision: str, threads: int, debug: bool | None) -> None:

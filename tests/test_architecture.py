@@ -37,8 +37,11 @@ RANKS: list[list[str]] = [
     ["slam", "baselines", "viewer"],
     ["methods", "results"],
     ["inspection"],
-    ["identity", "checkpoint", "pipeline", "command_line"],
-    ["experiments"],
+    [
+        *("frame_loop", "feeding", "session"),
+        *("identity", "checkpoint", "pipeline", "command_line"),
+    ],
+    ["experiments", "live"],
     ["commands"],
     ["apps"],
 ]
@@ -76,7 +79,9 @@ ORDERS: dict[str, list[str]] = {
             "conversion",
         ),
         "evaluation",
-        *("slam", "viewer", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
+        *("slam", "viewer", "baselines", "methods", "results", "frame_loop"),
+        *("feeding", "session"),
+        *("identity", "checkpoint", "pipeline"),
         "command_line",
     ],
     "event_images": [
@@ -118,6 +123,11 @@ ORDERS: dict[str, list[str]] = {
         *("views", "splat_file", "gltf", "camera_paths", "other_formats", "shown_run", "browse", "sensor"),
         *("metrics", "folder"),
     ],
+    "feeding": ["intake", "cutter", "sequence", "inlet", "run"],
+    "live": [
+        *("items", "messages", "addresses", "recording", "connections", "folder", "cameras", "client"),
+        *("warm_up", "loop"),
+    ],
     "experiments": [
         *("cases", "selection", "recordings", "runs", "ablations", "report", "documents", "long_stream"),
         *("kernel_times", "front_end", "steps", "benchmark"),
@@ -140,6 +150,7 @@ LIBRARIES: dict[str, list[str]] = {
         "command_line",
         "simulation",
         "datasets",
+        *("live", "commands.live"),
     ],
     "yaml": ["config", "datasets"],
     "scipy": [
@@ -155,6 +166,7 @@ LIBRARIES: dict[str, list[str]] = {
             "event_files",
             "datasets",
             "conversion",
+            *("feeding", "live"),
             "inspection",
             "simulation",
             "event_images",
@@ -177,7 +189,10 @@ LIBRARIES: dict[str, list[str]] = {
     "hdf5plugin": ["event_files", "datasets", "experiments.front_end"],
     "rosbags": ["event_files"],
     "aedat": ["event_files"],
-    "rich": ["patient_console", "event_files", "datasets", "results", "pipeline", "experiments", "commands"],
+    "rich": [
+        *("patient_console", "event_files", "datasets", "results", "feeding", "session", "pipeline"),
+        *("experiments", "live", "commands"),
+    ],
     "psutil": ["experiments.long_stream"],
     "ray": ["experiments.scheduler"],
     "viser": ["viewer.server"],

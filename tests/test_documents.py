@@ -397,6 +397,28 @@ def test_recipe_for_a_viewer(tmp_path: Path, tiny_folder: Path, capsys: pytest.C
         assert printed.rstrip().endswith("the run is saved")
 
 
+@pytest.mark.slow
+def test_recipe_for_a_live_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from edslam_ti.live import loop
+    from edslam_ti.viewer import NoViewer
+
+    monkeypatch.setattr(loop, "warm_up", lambda config: None)
+    source = recipe("A live source")["Noise"](0.4)
+    config = settings(out=str(tmp_path), mapping={"enabled": False})
+    folder = loop.run_live(source, config, loop.LiveSettings(), Console(quiet=True), NoViewer())
+    assert json.loads((folder / "metrics.json").read_text())["num_frames"] >= 6
+
+
+@pytest.mark.slow
+def test_programs_in_live_md_run(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs/live.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(compile(block, "live.md", "exec"), {"__name__": "a program in live.md"})
+    assert capsys.readouterr().out.strip() == "5 ()"
+
+
 # --- tables ---
 
 

@@ -21,7 +21,7 @@ import yaml
 from rich.console import Console
 from sequences import settings
 
-from edslam_ti import pipeline
+from edslam_ti import frame_loop, pipeline
 from edslam_ti.command_line import UsageError, launch
 from edslam_ti.config import Config
 from edslam_ti.datasets import Sample, SampledSequence
@@ -45,7 +45,7 @@ ARTEFACTS = {
     *("trajectory_tum.txt", "trajectory_frontend_tum.txt", "truth_tum.txt", "poses.csv", "trajectory.png"),
     *("map.ply", "mesh.ply", "points.ply", "flythrough.mp4"),
     *("config.yaml", "metrics.json", "log.txt", "renders", "journal.csv", "run.json"),
-    *("index.html", "camera.json"),
+    *("index.html", "camera.json", "sensor.png"),
 }
 KEYS = {
     *("dataset", "scene", "method", "ate_rmse_cm", "ate_mean_cm", "ate_rmse_sim3_cm", "rpe_trans_cm"),
@@ -82,8 +82,8 @@ NAMES = [
     *("num_dropped_events", "data_notes", "contrast_threshold"),
     *("contrast_threshold_source", "contrast_threshold_positive", "contrast_threshold_negative"),
     *("contrast_threshold_deviation", "tracking_hz", "tracking_s", "mapping_s", "refinement_s", "device"),
-    *("version", "is_interrupted", "protocol", "protocols", "seconds_per_frame", "wall_s", "total_fps"),
-    "peak_memory_mb",
+    *("version", "is_interrupted", "protocol", "protocols", "sensor"),
+    *("seconds_per_frame", "wall_s", "total_fps", "peak_memory_mb"),
 ]
 
 
@@ -312,7 +312,7 @@ def test_free_memory_is_given_back_after_every_mapped_frame(
     is_mapping: bool, expected: int, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[int] = []
-    monkeypatch.setattr(pipeline, "release_free_memory", lambda: calls.append(1))
+    monkeypatch.setattr(frame_loop, "release_free_memory", lambda: calls.append(1))
     config = config_for(tiny_folder, tmp_path, duration=0.3, mapping={"enabled": is_mapping})
     assert metrics_of(quiet_run(config))["num_frames"] == 6
     assert len(calls) == expected
@@ -612,8 +612,12 @@ def test_part_that_fails_is_left_out(
     monkeypatch.setattr(results, part, fail)
     folder = quiet_run(config_for(tiny_folder, tmp_path, duration=0.2))
     assert "cannot be measured" in (folder / "log.txt").read_text()
-    made = {"plot_trajectory": "trajectory.png", "save_views": "renders", "run_metrics": "metrics.json"}
-    assert {p.name for p in folder.iterdir()} == ARTEFACTS - {made[part]}
+    made = {
+        "plot_trajectory": {"trajectory.png"},
+        "save_views": {"renders"},
+        "run_metrics": {"metrics.json", "index.html"},  # the page shows the metrics
+    }
+    assert {p.name for p in folder.iterdir()} == ARTEFACTS - made[part]
 
 
 def test_full_disk_while_saving_keeps_what_fits(

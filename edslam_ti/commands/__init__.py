@@ -10,6 +10,7 @@ from edslam_ti.command_line import launch
 
 COMMANDS = {
     "slam": "track an event camera and build a 3D Gaussian map",
+    "live": "track data while they come: a camera, another process, a recording played",
     "view": "show finished runs in a window, or draw them into a picture",
     "export": "write a finished run for other programs: splats, glTF, KITTI, COLMAP, nerfstudio",
     "evaluate": "compare two trajectories, and a mesh with the true surfaces",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -186,6 +186,31 @@ SAME_TIME = 1e-6  # s; float64 seconds since the epoch are multiples of 2.4e-7
 MANY_OUTSIDE = 0.1  # a note is made if more than this share of the depth images have no events around them
 
 
+def times_between(
+    a: float,  # seconds, of a sample
+    b: float,  # seconds, of the next depth image
+    max_interval: float,  # seconds
+    has_events: bool,
+) -> list[float]:
+    """Return the times of the samples after `a` up to `b`: long gaps are divided where events are."""
+    pieces = int(np.ceil((b - a) / max_interval - ROUNDING)) if has_events else 1
+    return [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
+
+
+class Samples(Protocol):
+    """What evaluation needs of a run's samples."""
+
+    @property
+    def has_depth(self) -> np.ndarray:  # [S] bool
+        """Which samples have a depth image that can be compared with the map."""
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+
+    def without_events(self, k: int) -> Sample:
+        """Return sample k without its events."""
+
+
 class SampledSequence:
     """A sequence cut to [start, start + duration] and divided into samples.
 
@@ -231,9 +256,9 @@ class SampledSequence:
             )
         times, has_depth = [float(inside[0])], [True]
         for a, b in itertools.pairwise(inside):
-            pieces = int(np.ceil((b - a) / max_interval - ROUNDING)) if sequence.has_events else 1
-            times += [float(a + (b - a) * k / pieces) for k in range(1, pieces)] + [float(b)]
-            has_depth += [False] * (pieces - 1) + [True]
+            between = times_between(a, b, max_interval, sequence.has_events)
+            times += between
+            has_depth += [False] * (len(between) - 1) + [True]
         self.timestamps = np.array(times)  # [S]
         self.has_depth = np.array(has_depth)  # [S] bool: a depth image exists; it may turn out unusable
         self._depth_index = np.searchsorted(stamps, self.timestamps, side="left")

@@ -160,7 +160,13 @@ def decode(path: Path, flags: int, camera: Camera | None = None, what: str = "im
     Bytes are read here, because OpenCV accepts only names in UTF-8. The size in a PNG's header is checked
     first: a few bytes may claim gigabytes.
     """
-    data = file_bytes(path, what)
+    return decode_bytes(file_bytes(path, what), path, flags, camera, what)
+
+
+def decode_bytes(
+    data: bytes, path: Path, flags: int, camera: Camera | None = None, what: str = "image"
+) -> np.ndarray:
+    """Return the pixels of what an image file holds; `path` names it in messages."""
     if data[:8] == PNG_SIGNATURE and len(data) >= 24:
         width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
         check_size(path, (height, width), camera, what)

@@ -15,7 +15,6 @@ from rich.text import Text
 from edslam_ti.depth_images import without_depth_edges
 from edslam_ti.errors import LONGEST_MESSAGE, plain
 from edslam_ti.evaluation.images import LinearFit
-from edslam_ti.event_images.sensor import estimate_sensor
 from edslam_ti.interruption import Interruption, Stopped
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.output import atomic_file
@@ -88,6 +87,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
         if metrics is not None:
             metrics |= {"sensor": sensor}
             numbers = metrics | cost_metrics(run, saving_seconds=time.perf_counter() - started)
+            numbers |= run.live_metrics
             text = json.dumps(numbers, indent=2) + "\n"
             parts.write("metrics", lambda: _write_text(folder / "metrics.json", text))
             for line in (*numbers["data_notes"], *numbers["problems"], *numbers["truth_notes"]):
@@ -162,11 +162,10 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _describe_sensor(run: Run, path: Path) -> Metrics | None:
-    """Draw what the recording says about its event sensor; return it. None: there are no events."""
-    if not run.sequence.has_events:
+    """Draw what the recording says about its event sensor; return it, None where it says nothing."""
+    estimate = run.sensor
+    if estimate is None:
         return None
-    first, last = (float(t) for t in run.samples.timestamps[[0, -1]])
-    estimate = estimate_sensor(run.sequence, first, last)
     for line in sensor_lines(estimate, run.contrast):
         run.note(f"sensor: {line}")
     plot_sensor(estimate, run.contrast, path)

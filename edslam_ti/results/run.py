@@ -3,11 +3,13 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from edslam_ti.config import Config
-from edslam_ti.datasets import EventDepthSequence, SampledSequence
+from edslam_ti.datasets import EventDepthSequence
+from edslam_ti.datasets.base import Samples
 from edslam_ti.event_images.contrast import ContrastThreshold
+from edslam_ti.event_images.sensor import SensorEstimate
 from edslam_ti.slam import Slam
 from edslam_ti.trajectory import Trajectory
 from edslam_ti.truth import true_poses_at
@@ -23,10 +25,11 @@ class Run:
 
     config: Config
     sequence: EventDepthSequence
-    samples: SampledSequence
+    samples: Samples
     slam: Slam
     held_out: set[int]  # sample indices kept from mapping
     contrast: ContrastThreshold
+    sensor: SensorEstimate | None = None  # None: there are no events, or they do not tell
     num_events: int = 0
     finish_seconds: float = 0.0
     is_refined: bool = False  # the map's final steps are done
@@ -34,6 +37,7 @@ class Run:
     started: float = field(default_factory=time.perf_counter)
     messages: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)  # parts of the evaluation that failed, and why
+    live_metrics: dict[str, Any] = field(default_factory=dict)  # of data that came while it was processed
 
     def note(self, message: str) -> None:
         """Add a line to the log, with the seconds since the start."""

@@ -16,6 +16,7 @@ from edslam_ti.output import atomic_file
 
 RUNNING, FINISHED, INTERRUPTED, FAILED = "running", "finished", "interrupted", "failed"  # states in run.json
 STATE, LOCK, SETTINGS, CHECKPOINTS = "run.json", ".lock", "config.yaml", "checkpoint"
+FED = "fed"  # in the identity of a run whose data came from a session
 
 
 class RunFolder:
@@ -62,6 +63,9 @@ class RunFolder:
             folder.close()
             raise DataError(f"{path}: this run has finished; there is nothing to resume")
         folder.identity = state.get("identity") or {}
+        if folder.identity.get(FED):
+            folder.close()
+            raise DataError(f"{path}: the data of a session cannot be read again, so it cannot be resumed")
         for partial in path.rglob(".*.partial*"):  # of files that the process that was cut off did not finish
             partial.unlink(missing_ok=True)
         return folder
