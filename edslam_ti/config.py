@@ -323,6 +323,9 @@ class Config(Stage):
     """C in Eq. 11. Omitted: the data set's own (camera.json), else estimated from its images, else 0.1;
     events alone do not determine it, so log brightness is then known up to a factor. Given: the mean of C+
     and C-, whose ratio is estimated from the images, if there are any."""
+    dead_time: float | None = Field(None, ge=0, lt=1)
+    """Seconds after an event in which its pixel is blind; the change missed meanwhile is estimated from the
+    intervals between events. 0: none. Omitted: estimated from the data."""
     depth_rate: float | None = Field(None, ge=1e-3, le=1e5)
     """Hz, of depth images that are numbered by index, not by milliseconds (event_replica). Omitted: that in
     camera.json."""

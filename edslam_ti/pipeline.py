@@ -280,7 +280,7 @@ def make_slam(
         tracker = TruePoses(sequence.true_pose, true_path(sequence.truth).likely_pose_at)
     truth = sequence.true_pose(float(samples.timestamps[0]))
     return Slam(
-        FrameBuilder(sequence.camera),
+        FrameBuilder(sequence.camera, contrast.dead_time),
         tracker,
         mapper if config.mapping.enabled else None,
         initial_pose=np.eye(4) if truth is None else truth,
@@ -290,7 +290,7 @@ def make_slam(
 def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> ContrastThreshold:
     """Return the contrast threshold of a run, with its source."""
     first, last = (float(t) for t in samples.timestamps[[0, -1]])
-    return contrast_threshold(config.contrast_threshold, sequence, first, last)
+    return contrast_threshold(config.contrast_threshold, sequence, first, last, config.dead_time or 0.0)
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:
