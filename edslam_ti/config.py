@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 from edslam_ti.errors import ConfigError, EdSlamError, plain
 from edslam_ti.rgbd_config import SmallGicpConfig, SplatamConfig
-from edslam_ti.sensor_config import SensorConfig
+from edslam_ti.sensor_config import DepthSensorConfig, SensorConfig
 from edslam_ti.stage import Stage
 
 CONFIGS = Path(__file__).parent / "configs"  # <dataset>.yaml: settings for a data set
@@ -348,6 +348,7 @@ class Config(Stage):
     seed: int = Field(0, ge=0)
     """Seed of every random choice."""
     sensor: SensorConfig = SensorConfig()
+    depth_sensor: DepthSensorConfig = DepthSensorConfig()
     time_surface: TimeSurfaceConfig = TimeSurfaceConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()

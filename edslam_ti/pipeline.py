@@ -24,6 +24,7 @@ from edslam_ti.errors import DataError, EdSlamError, plain
 from edslam_ti.evaluation.lpips import load_lpips
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
+from edslam_ti.event_images.sensor import estimate_sensor
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.identity import compare, identity_of
 from edslam_ti.inspection.calibration import aligned, calibrate_depth
@@ -290,7 +291,10 @@ def make_slam(
 def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> ContrastThreshold:
     """Return the contrast threshold of a run, with its source."""
     first, last = (float(t) for t in samples.timestamps[[0, -1]])
-    return contrast_threshold(config.contrast_threshold, sequence, first, last, config.dead_time or 0.0)
+    dead_time = config.dead_time
+    if dead_time is None:
+        dead_time = estimate_sensor(sequence, first, last).dead_time if sequence.has_events else None
+    return contrast_threshold(config.contrast_threshold, sequence, first, last, dead_time or 0.0)
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

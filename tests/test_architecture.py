@@ -79,7 +79,9 @@ ORDERS: dict[str, list[str]] = {
         *("viewer", "slam", "baselines", "methods", "results", "identity", "checkpoint", "pipeline"),
         "command_line",
     ],
-    "event_images": ["change", "noisy", "sums", "solve", "contrast", "sharp"],
+    "event_images": [
+        *("change", "noisy", "sums", "solve", "contrast", "sharp", "intervals", "dead_time", "sensor"),
+    ],
     "tracking": [
         *(
             "consistency",
@@ -113,6 +115,7 @@ ORDERS: dict[str, list[str]] = {
     "evaluation": ["trajectories", "conventions", "truth_notes", "lpips", "images", "meshes"],
     "results": [
         *("run", "trust", "run_folder", "reading", "export", "maps", "pictures", "plots", "window", "views"),
+        "sensor",
         *("metrics", "folder"),
     ],
     "experiments": [

@@ -2,7 +2,8 @@
 
 Say what a recording holds and what looks wrong in it, before a run: PATH is the folder of a recording in any
 layout, or a file of events. Also writes one picture (--sheet, by default inspection.png in the current
-folder): events, time surface, depth, image, and depth edges over events, at a few times.
+folder): events, time surface, depth, image, and depth edges over events, at a few times; and, beside it,
+inspection_sensor.png: intervals between events of a pixel, and hot pixels.
 
     edslam inspect data/my_room
     edslam inspect recording.h5 --sheet recording.png
@@ -50,6 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     from edslam_ti.inspection.report import inspect
     from edslam_ti.inspection.sheet import write_sheet
     from edslam_ti.inspection.summary import lines
+    from edslam_ti.results.sensor import plot_sensor
 
     kernels.init("cpu", threads=options.threads)
     config = Config(dataset=options.dataset, threads=options.threads)
@@ -57,13 +59,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     with Progress(*columns, transient=True, console=Console(stderr=True)) as bar:
         task = bar.add_task("opening", total=None)
         sequence, refusal = open_path(options.path, config)
-        report = None
+        report = of_sensor = None
         if sequence is not None:
             report = inspect(sequence, config, lambda what: bar.update(task, description=what))
             write_sheet(report, options.sheet)
+            if report.sensor is not None:
+                of_sensor = options.sheet.with_name(f"{options.sheet.stem}_sensor.png")
+                plot_sensor(report.sensor, None, of_sensor)
     for line in lines(report, refusal):
         print(plain(line, 1000))
     if report is not None:
         print(f"picture: {plain(options.sheet, 4096)}")
+        if of_sensor is not None:
+            print(f"picture: {plain(of_sensor, 4096)}")
     if refusal is not None or (report is not None and report.findings):
         sys.exit(FAULTY)

@@ -32,7 +32,7 @@ from edslam_ti.datasets.rpg import RpgSequence, is_rpg
 from edslam_ti.datasets.tum_vie import TumVieSequence, is_tum_vie
 from edslam_ti.datasets.vector import VectorSequence, is_vector
 from edslam_ti.errors import ConfigError, plain
-from edslam_ti.sensor_config import SensorConfig
+from edslam_ti.sensor_config import DepthSensorConfig, SensorConfig
 
 __all__ = [
     "FORMATS",
@@ -83,7 +83,9 @@ def _make_builtin(scene: str, config: Config) -> Path:
     from edslam_ti.datasets.builtin import builtin_sequence_folder
     from edslam_ti.simulation.settings import SimulationConfig
 
-    return builtin_sequence_folder(scene, SimulationConfig(sensor=config.sensor))
+    return builtin_sequence_folder(
+        scene, SimulationConfig(sensor=config.sensor, depth_sensor=config.depth_sensor)
+    )
 
 
 # The choices of --dataset. Without it, a recording in the first format takes precedence over all others, and
@@ -199,11 +201,15 @@ def open_sequence(config: Config) -> EventDepthSequence:
                 f"{key}: expected with event_replica alone, got it with {found.dataset}, whose files state "
                 "the times of images; leave it out"
             )
-    if found.dataset != "builtin" and config.sensor != SensorConfig():
-        raise ConfigError(
-            f"sensor: expected with built-in rooms alone, which are simulated, got it with {found.dataset}; "
-            "leave it out"
-        )
+    for key, is_changed in (
+        ("sensor", config.sensor != SensorConfig()),
+        ("depth_sensor", config.depth_sensor != DepthSensorConfig()),
+    ):
+        if is_changed and found.dataset != "builtin":
+            raise ConfigError(
+                f"{key}: expected with built-in rooms alone, which are simulated, got it with "
+                f"{found.dataset}; leave it out"
+            )
     format = FORMATS[found.dataset]
     folder = found.folder
     if folder is None:

@@ -16,7 +16,16 @@ GENERATOR_VERSION = 2  # increase it when rooms, paths or rendering change, so t
 
 # Settings added since GENERATOR_VERSION was last increased. Their defaults change nothing, so recordings made
 # before stay valid.
-NEW_SETTINGS = ("path", "pose_rate", "event_gap", "depth_gap", "compact_events", "moving_object", "sensor")
+NEW_SETTINGS = (
+    "path",
+    "pose_rate",
+    "event_gap",
+    "depth_gap",
+    "compact_events",
+    "moving_object",
+    "sensor",
+    "depth_sensor",
+)
 
 
 class BuiltinSequence(EventReplicaSequence):
@@ -76,5 +85,7 @@ def key_of(settings: SimulationConfig) -> str:
     """Return a text that differs for every other recording: a preset counts by its values."""
     fields = SimulationConfig.model_fields
     unchanged = {name for name in NEW_SETTINGS if getattr(settings, name) == fields[name].default}
-    text = settings.model_dump_json(exclude=unchanged | {"sensor"})
-    return text if "sensor" in unchanged else f"{text} {json.dumps(settings.sensor.facts)}"
+    text = settings.model_dump_json(exclude=unchanged | {"sensor", "depth_sensor"})
+    for name, stage in (("sensor", settings.sensor), ("depth_sensor", settings.depth_sensor)):
+        text += "" if name in unchanged else f" {name} {json.dumps(stage.facts)}"
+    return text

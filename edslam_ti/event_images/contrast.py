@@ -50,6 +50,7 @@ class ContrastThreshold:
     deviation: float | None = None  # standard deviation of `value` among the pairs of images (jackknife)
     notes: tuple[str, ...] = ()  # what looks wrong with the events, a line each
     dead_time: float = 0.0  # seconds after an event in which its pixel is blind
+    deviations: tuple[float, float] | None = None  # the same of `positive` and `negative`
 
     @property
     def relative(self) -> tuple[float, float]:
@@ -123,7 +124,8 @@ class _Solution:
         n, means = len(self.without_one), self.without_one.mean(1)
         deviation = float(np.sqrt((n - 1) * means.var()))
         positive, negative = (float(c) for c in self.estimate)
-        return ContrastThreshold(0.5 * (positive + negative), "images", positive, negative, deviation)
+        value, of_each = 0.5 * (positive + negative), (float(self.deviations[0]), float(self.deviations[1]))
+        return ContrastThreshold(value, "images", positive, negative, deviation, deviations=of_each)
 
     @property
     def notes(self) -> tuple[str, ...]:

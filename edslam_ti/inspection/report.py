@@ -8,6 +8,7 @@ import numpy as np
 from edslam_ti.config import Config, dataset_differences
 from edslam_ti.datasets import EventDepthSequence
 from edslam_ti.errors import DataError
+from edslam_ti.event_images.sensor import SensorEstimate, estimate_sensor
 from edslam_ti.inspection.calibration import DepthCalibration, calibrate_depth
 from edslam_ti.inspection.clock_offsets import Offset, clock_findings
 from edslam_ti.inspection.edge_check import EdgeCheck, check_edges
@@ -66,6 +67,7 @@ class Report:
     sequence: EventDepthSequence
     checks: Checks
     tracked: Tracked | None
+    sensor: SensorEstimate | None  # None: there are no events
     findings: tuple[Finding, ...]
 
 
@@ -85,7 +87,11 @@ def inspect(sequence: EventDepthSequence, config: Config, progress: Progress) ->
             findings += fits_better(sequence, tracked.trajectory, poses, *checks.part)
     if not any(f.fault in ("truth_elsewhere", "truth_convention") for f in findings):
         findings += clock_findings(offsets)
-    return Report(sequence, checks, tracked, tuple(findings))
+    sensor = None
+    if sequence.has_events:
+        progress("looking at the sensor")
+        sensor = estimate_sensor(sequence, *sequence.time_range)
+    return Report(sequence, checks, tracked, sensor, tuple(findings))
 
 
 def check(sequence: EventDepthSequence, progress: Progress) -> Checks:

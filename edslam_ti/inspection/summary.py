@@ -7,6 +7,7 @@ from edslam_ti.event_images.contrast import contrast_from_images
 from edslam_ti.inspection.findings import Finding
 from edslam_ti.inspection.report import Report
 from edslam_ti.inspection.streams import RATE_BIN
+from edslam_ti.results.sensor import sensor_lines
 
 
 def lines(report: Report | None, refusal: Finding | None) -> list[str]:
@@ -48,7 +49,8 @@ def _events(report: Report) -> list[str]:
         f"{stamp_text(sequence, facts.end)} s), {facts.count / max(length, 1e-9) / 1e6:.3g} M/s on average, "
         f"{peak / 1e6:.3g} M/s at most, {facts.positive_share:.0%} brighter, {silent:.1%} of the pixels "
         "silent"
-        + (f", {sequence.num_dropped_events} bad rows left out" if sequence.num_dropped_events else "")
+        + (f", {sequence.num_dropped_events} bad rows left out" if sequence.num_dropped_events else ""),
+        "sensor: " + "; ".join(sensor_lines(report.sensor, None) if report.sensor is not None else ["-"]),
     ]
 
 
@@ -78,6 +80,8 @@ def _images(report: Report) -> list[str]:
     if estimate is not None:
         positive, negative = estimate.by_polarity
         said.append(f"from images {estimate.value:.3f} (brighter {positive:.3f}, darker {negative:.3f})")
+        if estimate.deviations is not None:
+            said.append("each +- {:.3f}, {:.3f}".format(*estimate.deviations))
     return [*result, f"contrast threshold: {', '.join(said)}"] if said else result
 
 

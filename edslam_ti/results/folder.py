@@ -15,6 +15,7 @@ from rich.text import Text
 from edslam_ti.depth_images import without_depth_edges
 from edslam_ti.errors import LONGEST_MESSAGE, plain
 from edslam_ti.evaluation.images import LinearFit
+from edslam_ti.event_images.sensor import estimate_sensor
 from edslam_ti.interruption import Interruption, Stopped
 from edslam_ti.mapping.mapper import Mapper
 from edslam_ti.output import atomic_file
@@ -24,6 +25,7 @@ from edslam_ti.results.metrics import Metrics, cost_metrics, run_metrics, slice_
 from edslam_ti.results.pictures import fly_through_frames, smooth_path, write_video
 from edslam_ti.results.plots import plot_trajectory
 from edslam_ti.results.run import Run
+from edslam_ti.results.sensor import plot_sensor, sensor_lines, sensor_metrics
 from edslam_ti.results.trust import Trust
 from edslam_ti.results.views import KINDS, ViewNumbers, save_views
 from edslam_ti.trajectory import write_tum
@@ -72,6 +74,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
             mesh = parts.add("mesh", lambda: _write_mesh(run, mapper, folder / "mesh.ply"))
             fit, video = views["held out"].fit, folder / "flythrough.mp4"
             parts.add("fly-through", lambda: _write_fly_through(run, mapper, fit, video))
+        sensor = parts.add("sensor", lambda: _describe_sensor(run, folder / "sensor.png"))
         metrics = parts.add("metrics", lambda: run_metrics(run, truth, slice_s, views, mesh, trust))
         if metrics is None:  # without the mesh and the path, which could not be measured
             metrics = parts.add(
@@ -80,6 +83,7 @@ def save(run: Run, folder: Path, console: Console, interruption: Interruption) -
         if metrics is None:
             metrics = parts.write("metrics", lambda: run_metrics(run, None, None, NO_VIEWS, None, trust))
         if metrics is not None:
+            metrics |= {"sensor": sensor}
             numbers = metrics | cost_metrics(run, saving_seconds=time.perf_counter() - started)
             text = json.dumps(numbers, indent=2) + "\n"
             parts.write("metrics", lambda: _write_text(folder / "metrics.json", text))
@@ -149,6 +153,17 @@ def _write_log(run: Run, folder: Path) -> None:
 def _write_text(path: Path, text: str) -> None:
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _describe_sensor(run: Run, path: Path) -> Metrics | None:
+    """Draw what the recording says about its event sensor; return it. None: there are no events."""
+    if not run.sequence.has_events:
+        return None
+    estimate = estimate_sensor(run.sequence, *(float(t) for t in run.samples.timestamps[[0, -1]]))
+    for line in sensor_lines(estimate, run.contrast):
+        run.note(f"sensor: {line}")
+    plot_sensor(estimate, run.contrast, path)
+    return sensor_metrics(estimate, run.contrast)
 
 
 def _draw_trajectory(run: Run, trust: Trust, path: Path) -> None:

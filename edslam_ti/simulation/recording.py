@@ -10,7 +10,7 @@ novel_views/, surfaces.ply      for evaluation only, see truth.py
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,11 +21,11 @@ from edslam_ti.camera import NEAREST, Camera
 from edslam_ti.errors import DataError
 from edslam_ti.kernels.event_simulation import EventArrays
 from edslam_ti.output import atomic_folder, check_replaceable, write_npy_header
-from edslam_ti.sensor_config import SensorConfig
-from edslam_ti.simulation.depth_noise import kinect_depth
+from edslam_ti.sensor_config import DepthSensorConfig, SensorConfig
 from edslam_ti.simulation.event_sensor import make_sensor
 from edslam_ti.simulation.moving import MovingObject, MovingRenderer
 from edslam_ti.simulation.paths import CameraPath
+from edslam_ti.simulation.recorded_images import DepthWriter, ImageWriter
 from edslam_ti.simulation.renderer import Render
 from edslam_ti.simulation.scene import Scene
 from edslam_ti.simulation.settings import SimulationConfig
@@ -67,8 +67,11 @@ def simulate(
     """
     duration = min(config.duration, path.duration)
     image_times = _millisecond_times(config.image_rate, duration)
+    depth_sensor = config.depth_measured_by
     depth_times = [
-        t for t in _millisecond_times(config.depth_rate, duration) if not _is_in(config.depth_gap, t)
+        t
+        for t in _millisecond_times(depth_sensor.rate or config.depth_rate, duration, depth_sensor.phase)
+        if not _is_in(config.depth_gap, t)
     ]
     if min(len(image_times), len(depth_times)) < 2:
         raise DataError(
@@ -85,8 +88,8 @@ def simulate(
         known = f"{config.contrast_threshold:g}" if config.states_threshold else UNKNOWN
         threshold = folder / f"event_threshold_{known}"
         threshold.mkdir()
-        images = _ImageWriter(folder / "images", image_times, config.exposure)
-        depths = _DepthWriter(folder / "depth", set(depth_times), config)
+        images = ImageWriter(folder / "images", image_times, config.exposure)
+        depths = DepthWriter(folder / "depth", set(depth_times), config, path, renderer)
         now, num_frames = 0, 1
         render = renderer.render(path.pose(0.0), 0.0)
         sensor = make_sensor(config, _log_intensity(render, config))
@@ -160,10 +163,10 @@ def _log_intensity(render: Render, config: SimulationConfig) -> np.ndarray:  # [
     return np.log(render.grey + np.float32(config.log_epsilon))
 
 
-def _millisecond_times(rate: float, duration: float) -> list[int]:
-    """Return times k / rate up to the duration, rounded to whole milliseconds, in nanoseconds."""
+def _millisecond_times(rate: float, duration: float, phase: float = 0.0) -> list[int]:
+    """Return times phase + k / rate up to the duration, rounded to whole milliseconds, in nanoseconds."""
     count = int(np.floor(duration * rate + 1e-6)) + 1
-    stamps = [round(1e3 * k / rate) * MILLISECOND for k in range(count)]
+    stamps = [round(1e3 * phase + 1e3 * k / rate) * MILLISECOND for k in range(count)]
     return sorted({t for t in stamps if t <= round(duration * 1e9)})
 
 
@@ -246,80 +249,6 @@ class EventFileWriter:
         self._file.close()
 
 
-@dataclass
-class _ImageWriter:
-    """Writes images at given times; each is the mean brightness over its exposure."""
-
-    folder: Path
-    times: list[int]  # nanoseconds
-    exposure: float  # seconds
-    _sums: dict[int, np.ndarray] = field(default_factory=dict)  # image time -> integral over ns
-    _spans: dict[int, int] = field(default_factory=dict)
-    _next: int = 0
-
-    def add(self, start: int, grey_start: np.ndarray, end: int, grey_end: np.ndarray) -> None:
-        """Add the brightness of the interval [start, end], linear in time."""
-        half = round(self.exposure * 0.5e9)
-        while self._next < len(self.times) and self.times[self._next] - half <= end:
-            t = self.times[self._next]
-            if half == 0:
-                self._write(t, grey_end if t == end else grey_start)
-            else:
-                self._sums[t], self._spans[t] = np.zeros(grey_start.shape), 0
-            self._next += 1
-        for t in list(self._sums):
-            low, high = max(start, t - half), min(end, t + half)
-            if high > low:
-                middle = ((low + high) / 2 - start) / (end - start)
-                self._sums[t] += (high - low) * ((1 - middle) * grey_start + middle * grey_end)
-                self._spans[t] += high - low
-            if end >= t + half:
-                self._finish(t)
-
-    def finish(self) -> None:
-        """Write images whose exposure extends beyond the recording."""
-        for t in list(self._sums):
-            self._finish(t)
-
-    def _finish(self, t: int) -> None:
-        self._write(t, self._sums.pop(t) / self._spans.pop(t))
-
-    def _write(self, t: int, grey: np.ndarray) -> None:
-        _write_png(self.folder / _frame_name(t), np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8))
-
-
-@dataclass
-class _DepthWriter:
-    """Writes depth images at given times, with noise if the settings say so."""
-
-    folder: Path
-    times: set[int]  # nanoseconds
-    config: SimulationConfig
-
-    def add(self, t: int, render: Render) -> None:
-        """Write the depth of a frame if its time is that of a depth image."""
-        if t not in self.times:
-            return
-        depth = render.depth
-        if self.config.depth_noise == "kinect":
-            rng = np.random.default_rng([self.config.seed, t // MILLISECOND])
-            depth = kinect_depth(depth, render.cosine, self.config.camera, rng)
-        units = np.rint(depth.astype(np.float64) * DEPTH_UNITS_PER_METRE)
-        units[units > np.iinfo(np.uint16).max] = 0
-        _write_png(self.folder / _frame_name(t), units.astype(np.uint16))
-
-
-def _frame_name(t: int) -> str:
-    return f"frame{t // MILLISECOND:06d}.png"
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    import cv2
-
-    if not cv2.imwrite(str(path), image):
-        raise DataError(f"{path}: could not be written; is the disk full?")
-
-
 def _write_poses(folder: Path, path: CameraPath, times: list[int]) -> None:
     """Write times and poses, one per line."""
     with (folder / "poses_ts.txt").open("w") as stamps, (folder / "traj.txt").open("w") as poses:
@@ -363,8 +292,11 @@ def _write_descriptions(folder: Path, scene: Scene, config: SimulationConfig) ->
 
 def _shown_settings(config: SimulationConfig) -> dict[str, Any]:
     """Return the settings by name, those of the sensor with the preset's values, if there are faults."""
-    values = config.model_dump(exclude={"sensor"})
-    if config.sensor == SensorConfig():
-        return values
-    values["sensor"] = config.sensor.preset
-    return values | {f"sensor.{name}": value for name, value in config.sensor.facts.items()}
+    values = config.model_dump(exclude={"sensor", "depth_sensor"})
+    if config.sensor != SensorConfig():
+        values["sensor"] = config.sensor.preset
+        values |= {f"sensor.{name}": value for name, value in config.sensor.facts.items()}
+    if config.depth_sensor != DepthSensorConfig():
+        values["depth_sensor"] = config.depth_sensor.preset
+        values |= {f"depth_sensor.{name}": value for name, value in config.depth_sensor.facts.items()}
+    return values

@@ -6,7 +6,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from edslam_ti.config import Stage
 from edslam_ti.errors import ConfigError, shown
-from edslam_ti.sensor_config import SensorConfig
+from edslam_ti.sensor_config import DEPTH_PRESETS, DepthSensor, DepthSensorConfig, SensorConfig
 
 if TYPE_CHECKING:  # reading options must not load numpy
     from edslam_ti.camera import Camera
@@ -71,6 +71,7 @@ class SimulationConfig(Stage):
     seed: int = Field(0, ge=0, le=2**31 - 1)
     """Seed of path, threshold noise, depth noise, and of all that is random in the sensor."""
     sensor: SensorConfig = SensorConfig()
+    depth_sensor: DepthSensorConfig = DepthSensorConfig()
 
     def __init__(self, **values: Any) -> None:
         """Check the values; the first invalid one raises `ConfigError`."""
@@ -95,6 +96,16 @@ class SimulationConfig(Stage):
     def states_threshold(self) -> bool:
         """Whether the recording says what C is: real ones do not."""
         return self.sensor.sensor.is_ideal and self.sensor.sensor.positive_threshold is None
+
+    @property
+    def depth_measured_by(self) -> DepthSensor:
+        """The depth sensor; `depth_noise` chooses one, too."""
+        sensor = self.depth_sensor.sensor
+        if self.depth_noise == "none":
+            return sensor
+        if self.depth_sensor != DepthSensorConfig():
+            raise ConfigError("depth_noise: expected it alone or depth_sensor alone, got both; leave one out")
+        return DEPTH_PRESETS["kinect"]
 
     @property
     def camera(self) -> "Camera":
