@@ -265,6 +265,8 @@ class GaussianMapper(ShownMap):
         was_solved, epsilon = self.images.is_solved, self._config.log_epsilon
         newest = evenly(self.images.newest_frames, MAX_RECOLOURED)
         changed = self.images.frames if is_thorough or not was_solved else newest
+        if not changed:  # a window has just begun, and no frame of it is kept so far
+            return was_solved
         before = {k: self.images.log_brightness(k) for k in changed} if was_solved else {}
         if compares_pixels and not self._compare_pixels(trajectory):
             return False

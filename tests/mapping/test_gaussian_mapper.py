@@ -226,6 +226,19 @@ def test_start_image_is_solved_as_often_when_frames_are_dropped(
     assert solved_at[-2:] == [5, 10]  # of 14 frames
 
 
+@pytest.mark.parametrize("last", [4, 9])  # the start image is solved after every fifth frame
+@pytest.mark.parametrize("held_out", [set(), {6}, {11}])
+def test_a_window_may_begin_where_the_start_image_is_solved(
+    tiny_sequence: EventDepthSequence, tiny_samples: list[Sample], last: int, held_out: set[int]
+) -> None:
+    times = [sample.timestamp for sample in tiny_samples]
+    stretch = (times[last] + times[last - 1]) / 2 - times[0]
+    _, mapper = mapped(tiny_sequence, tiny_samples[:13], held_out, stretch=stretch)
+    assert mapper.images.is_solved
+    steps = len(mapper.images.frames) - 2  # from the third frame on
+    assert mapper.num_steps == FEW["final_iterations"] + steps
+
+
 def test_faded_gaussians_are_pruned(tiny_sequence: EventDepthSequence, tiny_samples: list[Sample]) -> None:
     slam, mapper = mapped(tiny_sequence, tiny_samples[:5], finish=False)
     before = mapper.num_gaussians
