@@ -155,9 +155,12 @@ class MappingConfig(Stage):
     """Opacity of a new Gaussian."""
     min_opacity: float = Field(0.05, ge=0, lt=1)
     """Gaussians with a lower opacity are pruned."""
-    stretch: float = Field(3.0, gt=0)
+    stretch: float | None = Field(None, gt=0)
     """Seconds of events measured from one start image; each such window has its own, so that errors do not
-    accumulate."""
+    accumulate. Omitted: 3, or 1 where the events show dead time or noise."""
+    compare_pixels: int = Field(2, ge=0)
+    """How many times each pixel's thresholds are found from what the map shows (0: never), before the final
+    steps. Where pixels are alike, nothing changes."""
     solved_views: int = Field(24, ge=3)
     """At most this many frames of a window are compared when its start image is solved."""
     max_views: int = Field(150, ge=10)

@@ -8,7 +8,7 @@ far are saved.
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -291,10 +291,12 @@ def make_slam(
 def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> ContrastThreshold:
     """Return the contrast threshold of a run, with its source."""
     first, last = (float(t) for t in samples.timestamps[[0, -1]])
+    sensor = estimate_sensor(sequence, first, last) if sequence.has_events else None
     dead_time = config.dead_time
     if dead_time is None:
-        dead_time = estimate_sensor(sequence, first, last).dead_time if sequence.has_events else None
-    return contrast_threshold(config.contrast_threshold, sequence, first, last, dead_time or 0.0)
+        dead_time = sensor.dead_time if sensor is not None else None
+    threshold = contrast_threshold(config.contrast_threshold, sequence, first, last, dead_time or 0.0)
+    return replace(threshold, is_noisy=bool(dead_time) or (sensor is not None and sensor.is_noisy))
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

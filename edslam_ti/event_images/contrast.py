@@ -50,6 +50,7 @@ class ContrastThreshold:
     deviation: float | None = None  # standard deviation of `value` among the pairs of images (jackknife)
     notes: tuple[str, ...] = ()  # what looks wrong with the events, a line each
     dead_time: float = 0.0  # seconds after an event in which its pixel is blind
+    is_noisy: bool = False  # the events show dead time or noise
     deviations: tuple[float, float] | None = None  # the same of `positive` and `negative`
 
     @property
@@ -172,9 +173,7 @@ class _Products:
     events: np.ndarray  # [2] positive and negative ones
 
 
-def _products(
-    sequence: EventDepthSequence, first: int, second: int, dead_time: float
-) -> _Products | None:
+def _products(sequence: EventDepthSequence, first: int, second: int, dead_time: float) -> _Products | None:
     """Return the sums of a pair of images, None where one of them cannot be read."""
     before, after = sequence.image_or_none(first), sequence.image_or_none(second)
     if before is None or after is None:

@@ -1,7 +1,8 @@
 """Each pixel's own thresholds, found by comparing its events with what a map of many pixels shows.
 
-The thresholds of a real sensor differ from pixel to pixel, by 10 to 20 %, for both polarities separately. So a
-pixel's change E (Eq. 11) is too large by a share of it, and drifts with the sum A of all changes, up and down:
+The thresholds of a real sensor differ from pixel to pixel, by 10 to 20 %, for both polarities separately. So
+a pixel's change E (Eq. 11) is too large by a share of it, and drifts with the sum A of all changes, up and
+down:
 
     true change = E + a E + b A        a = (d+ + d-) / 2,  b = (d+ - d-) / 2,  d: relative errors of C+, C-
 

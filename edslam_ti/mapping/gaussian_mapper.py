@@ -33,7 +33,6 @@ LAST_RATE = 0.05  # learning rates fall to this share of their values during the
 WHITE_LEVEL = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between two solves of the start image
 MAX_RECOLOURED = 8  # after each solve, Gaussians are recoloured from at most this many frames
-ALTERNATIONS = 3  # between the map and the thresholds of pixels
 LEAST_ALPHA = 0.8  # where the map shows a surface
 SETTLING = (0.002, 0.1)  # metres, degrees: the map does not follow smaller changes of poses
 
@@ -127,7 +126,7 @@ class GaussianMapper(ShownMap):
         """Solve all start images; return where the final steps begin, None where nothing can be refined."""
         if len(self.gaussians) == 0 or not self._solve_brightness(trajectory, is_thorough=True):
             return None
-        for _ in range(ALTERNATIONS):
+        for _ in range(self._config.compare_pixels):
             if not self._solve_brightness(trajectory, is_thorough=True, compares_pixels=True):
                 break
         allowed = self.budget.left()
