@@ -25,6 +25,7 @@ from edslam_ti.evaluation.lpips import load_lpips
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.event_images.sensor import estimate_sensor
+from edslam_ti.event_images.start_bias import start_bias
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.identity import compare, identity_of
 from edslam_ti.inspection.calibration import aligned, calibrate_depth
@@ -43,6 +44,7 @@ from edslam_ti.tracking.tracker import Tracker, TruePoses
 from edslam_ti.truth import true_path
 from edslam_ti.viewer import VIEWERS, Viewer
 
+EARLIER = 0.1  # seconds of events before the first sample, which has them, too
 ATE_EVERY = 10  # frames between updates of the error on the progress bar
 Opener = Callable[[Config, Console], EventDepthSequence]
 MOST_UNREADABLE = 10  # frames in a row of which something cannot be read: the recording is damaged
@@ -296,7 +298,10 @@ def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSe
     if dead_time is None:
         dead_time = sensor.dead_time if sensor is not None else None
     threshold = contrast_threshold(config.contrast_threshold, sequence, first, last, dead_time or 0.0)
-    return replace(threshold, is_noisy=bool(dead_time) or (sensor is not None and sensor.is_noisy))
+    if not dead_time and (sensor is None or not sensor.is_noisy):
+        return threshold
+    begin = max(first - EARLIER, sequence.time_range[0])
+    return replace(threshold, is_noisy=True, start_bias=start_bias(sequence, begin, threshold.relative))
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

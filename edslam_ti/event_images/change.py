@@ -74,11 +74,15 @@ class ChangeArchive:
         shape: tuple[int, int],
         positive: float = 1.0,  # change per event of each polarity, in (mean) thresholds
         negative: float = 1.0,
+        start_bias: float = 0.0,  # thresholds beyond the reference at the start, on average
     ) -> None:
         # Units per event; not rounded, because rounding errors would accumulate
         self._positive, self._negative = self.STEPS * positive, self.STEPS * negative
         self._level = np.zeros(shape, np.float32)  # units, sum of events since the start
-        self._beyond = np.zeros(shape, np.int16)  # units beyond the last event's level
+        # Pixels that have not fired yet stand where they stood at the start
+        self._beyond = np.full(
+            shape, round(self.STEPS * start_bias), np.int16
+        )  # units beyond the last event's level
         self._last_frame = np.zeros(shape, np.int32)  # frame of the pixel's last event
         self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
         self._total = np.zeros(shape, np.float32)  # units, sum of the events' sizes since the start

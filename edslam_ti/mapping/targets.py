@@ -61,7 +61,7 @@ class EventImages:
         self._config = config
         self._sharp_images = sharp_images
         self._stretch = config.stretch or (NOISY_STRETCH if contrast.is_noisy else STRETCH)
-        self._archive = ChangeArchive(camera.shape, *contrast.relative)
+        self._archive = ChangeArchive(camera.shape, *contrast.relative, contrast.start_bias)
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
         self._windows: list[_Window] = []
