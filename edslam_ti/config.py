@@ -212,6 +212,11 @@ class MappingConfig(Stage):
     poses_rate: float = Field(2e-5, gt=0)
     """Adam's learning rate of poses, metres and radians."""
 
+    @property
+    def longest_stretch(self) -> float:
+        """Seconds of `stretch`; 3 where it is omitted."""
+        return self.stretch or 3.0
+
 
 class ChangeConfig(Stage):
     """Windows of events of the mappers that compare two renders: ed_slam_paper, event_3dgs, inc_event_gs."""

@@ -22,7 +22,7 @@ from edslam_ti.event_images.solve import EventView, solve_start_image
 from edslam_ti.frame import Frame
 from edslam_ti.trajectory import Trajectory
 
-STRETCH, NOISY_STRETCH = 3.0, 1.0  # seconds, of a window unless the settings say otherwise
+NOISY_STRETCH = 1.0  # seconds of noisy events, unless the settings say otherwise
 MIN_VIEWS = 3  # frames needed before a start image can be solved
 QUICK = {4: 60}  # solver iterations for each reduction of the images, during the run
 THOROUGH = {4: 100, 2: 80}  # the same at the end
@@ -60,7 +60,7 @@ class EventImages:
         self._contrast_threshold = contrast.value
         self._config = config
         self._sharp_images = sharp_images
-        self._stretch = config.stretch or (NOISY_STRETCH if contrast.is_noisy else STRETCH)
+        self._stretch = config.stretch or (NOISY_STRETCH if contrast.is_noisy else config.longest_stretch)
         self._archive = ChangeArchive(camera.shape, *contrast.relative, contrast.start_bias)
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
