@@ -155,9 +155,9 @@ class MappingConfig(Stage):
     """Opacity of a new Gaussian."""
     min_opacity: float = Field(0.05, ge=0, lt=1)
     """Gaussians with a lower opacity are pruned."""
-    stretch: float | None = Field(None, gt=0)
+    stretch: float = Field(3.0, gt=0)
     """Seconds of events measured from one start image; each such window has its own, so that errors do not
-    accumulate. Omitted: 3, or 1 where the events show dead time or noise."""
+    accumulate."""
     compare_pixels: int = Field(2, ge=0)
     """How many times each pixel's thresholds are found from what the map shows (0: never), before the final
     steps. Where pixels are alike, nothing changes."""
@@ -211,11 +211,6 @@ class MappingConfig(Stage):
     """Optimise the frames' poses together with the map; align those without depth to it."""
     poses_rate: float = Field(2e-5, gt=0)
     """Adam's learning rate of poses, metres and radians."""
-
-    @property
-    def longest_stretch(self) -> float:
-        """Seconds of `stretch`; 3 where it is omitted."""
-        return self.stretch or 3.0
 
 
 class ChangeConfig(Stage):

@@ -301,7 +301,7 @@ def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSe
     if not dead_time and (sensor is None or not sensor.is_noisy):
         return threshold
     begin = max(first - EARLIER, sequence.time_range[0])
-    return replace(threshold, is_noisy=True, start_bias=start_bias(sequence, begin, threshold.relative))
+    return replace(threshold, start_bias=start_bias(sequence, begin, threshold.relative))
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

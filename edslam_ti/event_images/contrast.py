@@ -50,7 +50,6 @@ class ContrastThreshold:
     deviation: float | None = None  # standard deviation of `value` among the pairs of images (jackknife)
     notes: tuple[str, ...] = ()  # what looks wrong with the events, a line each
     dead_time: float = 0.0  # seconds after an event in which its pixel is blind
-    is_noisy: bool = False  # the events show dead time or noise
     start_bias: float = 0.0  # thresholds that brightness is beyond the references at the start, on average
     deviations: tuple[float, float] | None = None  # the same of `positive` and `negative`
 

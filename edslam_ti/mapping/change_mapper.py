@@ -151,11 +151,11 @@ class ChangeMapper(ShownMap):
         first = min(max(first, 0), last - 1)
         if first < 0:
             return None
-        while first < last - 1 and end.time - knots[first].time > self._config.longest_stretch:
+        while first < last - 1 and end.time - knots[first].time > self._config.stretch:
             first += 1
         start = knots[first]
         is_usable = end.num_events - start.num_events > FEWEST_EVENTS * pixels * settings.min_window
-        return (start, end) if is_usable and end.time - start.time <= self._config.longest_stretch else None
+        return (start, end) if is_usable and end.time - start.time <= self._config.stretch else None
 
     # --- steps ---
 
@@ -243,5 +243,5 @@ class ChangeMapper(ShownMap):
             Pair(k, k + gap, self._sums.change(knots[k], knots[k + gap]))
             for gap in gaps
             for k in range(len(knots) - gap)
-            if knots[k + gap].time - knots[k].time <= self._config.longest_stretch
+            if knots[k + gap].time - knots[k].time <= self._config.stretch
         ]

@@ -22,7 +22,6 @@ from edslam_ti.event_images.solve import EventView, solve_start_image
 from edslam_ti.frame import Frame
 from edslam_ti.trajectory import Trajectory
 
-NOISY_STRETCH = 1.0  # seconds of noisy events, unless the settings say otherwise
 MIN_VIEWS = 3  # frames needed before a start image can be solved
 QUICK = {4: 60}  # solver iterations for each reduction of the images, during the run
 THOROUGH = {4: 100, 2: 80}  # the same at the end
@@ -60,7 +59,6 @@ class EventImages:
         self._contrast_threshold = contrast.value
         self._config = config
         self._sharp_images = sharp_images
-        self._stretch = config.stretch or (NOISY_STRETCH if contrast.is_noisy else config.longest_stretch)
         self._archive = ChangeArchive(camera.shape, *contrast.relative, contrast.start_bias)
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
@@ -93,7 +91,7 @@ class EventImages:
         if not self._windows:
             level = np.float32(np.log(self._config.background))
             self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
-        elif frame.timestamp - self._started > self._stretch:
+        elif frame.timestamp - self._started > self._config.stretch:
             change, activity = (self._contrast_threshold * part for part in self._archive.reset())
             if self._pixels is not None:
                 change = self._pixels.corrected(change, activity)
