@@ -16,12 +16,15 @@ def found(pending: float) -> float:  # thresholds of brighter events, largest at
     rng = np.random.default_rng(0)
     rate = rng.normal(0, 10, SHAPE)  # 1/s
     before = pending * C * rng.random(SHAPE)
-    rows = []
-    for (y, x), slope in np.ndenumerate(rate):
-        first = (C - before[y, x]) / slope if slope > 0 else (C + before[y, x]) / -slope
-        rows += [(x, y, t, np.sign(slope)) for t in np.arange(first, 0.1, C / abs(slope))]
-    x, y, t, polarity = np.array(sorted(rows, key=lambda r: r[2])).T
-    events = Events(x.astype(np.int16), y.astype(np.int16), t, polarity.astype(np.int8))
+    rows: list[tuple[int, int, float, float]] = []
+    for y in range(SHAPE[0]):
+        for x in range(SHAPE[1]):
+            slope, first = float(rate[y, x]), float(before[y, x])
+            wait = (C - first) / slope if slope > 0 else (C + first) / -slope
+            times = np.arange(wait, 0.1, C / abs(slope)).tolist()
+            rows += [(x, y, t, 1.0 if slope > 0 else -1.0) for t in times]
+    u, v, time, polarity = np.array(sorted(rows, key=lambda r: r[2])).T
+    events = Events(u.astype(np.int16), v.astype(np.int16), time, polarity.astype(np.int8))
     camera = SimpleNamespace(shape=SHAPE)
     return start_bias(SimpleNamespace(events=events.between, camera=camera), 0.0, (1.0, 1.0))  # type: ignore[arg-type]
 
