@@ -158,6 +158,9 @@ class MappingConfig(Stage):
     stretch: float = Field(3.0, gt=0)
     """Seconds of events measured from one start image; each such window has its own, so that errors do not
     accumulate."""
+    compare_pixels: int = Field(2, ge=0)
+    """How many times each pixel's thresholds are found from what the map shows (0: never), before the final
+    steps. Where events show neither dead time nor noise, or pixels are alike, nothing changes."""
     solved_views: int = Field(24, ge=3)
     """At most this many frames of a window are compared when its start image is solved."""
     max_views: int = Field(150, ge=10)
@@ -323,6 +326,9 @@ class Config(Stage):
     """C in Eq. 11. Omitted: the data set's own (camera.json), else estimated from its images, else 0.1;
     events alone do not determine it, so log brightness is then known up to a factor. Given: the mean of C+
     and C-, whose ratio is estimated from the images, if there are any."""
+    dead_time: float | None = Field(None, ge=0, lt=1)
+    """Seconds after an event in which its pixel is blind; the change missed meanwhile is estimated from the
+    intervals between events. 0: none. Omitted: estimated from the data."""
     depth_rate: float | None = Field(None, ge=1e-3, le=1e5)
     """Hz, of depth images that are numbered by index, not by milliseconds (event_replica). Omitted: that in
     camera.json."""

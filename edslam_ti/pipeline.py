@@ -22,8 +22,9 @@ from edslam_ti.datasets import EventDepthSequence, Sample, SampledSequence, find
 from edslam_ti.errors import DataError, EdSlamError, plain
 from edslam_ti.evaluation.lpips import load_lpips
 from edslam_ti.evaluation.trajectories import ate_rmse_cm
-from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
-from edslam_ti.event_images.sensor import SensorEstimate, estimate_sensor
+from edslam_ti.event_images.contrast import ContrastThreshold
+from edslam_ti.event_images.own_sensor import own_sensor
+from edslam_ti.event_images.sensor import SensorEstimate
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.frame_loop import is_held_out, process_sample, speed_text, told
 from edslam_ti.identity import compare, identity_of
@@ -143,12 +144,12 @@ def _prepare(config: Config, console: Console, open_with: Opener) -> tuple[Viewe
     if config.calibrate == "depth":
         sequence = _with_calibrated_depth(sequence, config, console)
     samples = SampledSequence(sequence, config.start, config.duration, config.max_interval)
-    contrast = contrast_of(config, sequence, samples)
+    contrast, sensor = _own_sensor(config, sequence, samples)
     slam = make_slam(config, sequence, samples, contrast)
     for text in contrast.notes:
         sequence.note(text)
     held_out = held_out_frames(samples, config.evaluation.hold_out_every)
-    state = Run(config, sequence, samples, slam, held_out, contrast, sensor_of(sequence, samples))
+    state = Run(config, sequence, samples, slam, held_out, contrast, sensor)
     camera, (first, last) = sequence.camera, samples.timestamps[[0, -1]]
     scene, description = plain(sequence.scene), plain(sequence.description)
     state.note(f"{scene}: {description}, method {config.method}")
@@ -264,7 +265,7 @@ def make_slam(
         tracker = TruePoses(sequence.true_pose, true_path(sequence.truth).likely_pose_at)
     truth = sequence.true_pose(float(samples.timestamps[0]))
     return Slam(
-        FrameBuilder(sequence.camera),
+        FrameBuilder(sequence.camera, contrast.dead_time),
         tracker,
         mapper if config.mapping.enabled else None,
         initial_pose=np.eye(4) if truth is None else truth,
@@ -273,20 +274,14 @@ def make_slam(
 
 def contrast_of(config: Config, sequence: EventDepthSequence, samples: SampledSequence) -> ContrastThreshold:
     """Return the contrast threshold of a run, with its source."""
-    first, last = (float(t) for t in samples.timestamps[[0, -1]])
-    return contrast_threshold(config.contrast_threshold, sequence, first, last)
+    return _own_sensor(config, sequence, samples)[0]
 
 
-def sensor_of(sequence: EventDepthSequence, samples: SampledSequence) -> SensorEstimate | None:
-    """Return what the events of a run tell about their sensor; None where they cannot be read that far."""
-    if not sequence.has_events:
-        return None
+def _own_sensor(
+    config: Config, sequence: EventDepthSequence, samples: SampledSequence
+) -> tuple[ContrastThreshold, SensorEstimate | None]:
     first, last = (float(t) for t in samples.timestamps[[0, -1]])
-    try:
-        return estimate_sensor(sequence, first, last)
-    except (DataError, OSError) as error:
-        sequence.note(f"the event sensor is not examined: {error}")
-        return None
+    return own_sensor(config.contrast_threshold, config.dead_time, sequence, first, last)
 
 
 def held_out_frames(samples: SampledSequence, every: int) -> set[int]:

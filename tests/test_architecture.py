@@ -86,6 +86,7 @@ ORDERS: dict[str, list[str]] = {
     ],
     "event_images": [
         *("change", "noisy", "sums", "solve", "contrast", "sharp", "intervals", "dead_time", "sensor"),
+        *("start_bias", "pixel_thresholds", "own_sensor"),
     ],
     "tracking": [
         *(

@@ -35,10 +35,13 @@ class BrightnessChange:
         self._thresholds = np.float32(positive), np.float32(negative)
         self._numbers = np.zeros((*shape, 2), np.int32)  # negative and positive events
         self._last = np.zeros(shape, np.int8)  # polarity of the last event
+        self._missed: np.ndarray | None = None  # [H, W, 2] float32, in dead time
 
     def add(self, counts: EventCounts) -> None:
         """Add events; they must be later than all added before."""
         self._numbers += counts.numbers
+        if counts.missed is not None:
+            self._missed = counts.missed if self._missed is None else self._missed + counts.missed
         # Silent pixels keep their last polarity; a product and a sum are far faster than a masked copy.
         self._last *= counts.last == 0
         self._last += counts.last
@@ -49,11 +52,13 @@ class BrightnessChange:
         beyond = np.float32(NEWEST_BIAS)
         fell = self._numbers[..., 0].astype(np.float32) + beyond * (self._last < 0)
         rose = self._numbers[..., 1].astype(np.float32) + beyond * (self._last > 0)
+        if self._missed is not None:
+            fell, rose = fell + self._missed[..., 0], rose + self._missed[..., 1]
         return positive * rose - negative * fell
 
     def reset(self) -> None:
         """Start again with no change."""
-        self._numbers[:], self._last[:] = 0, 0
+        self._numbers[:], self._last[:], self._missed = 0, 0, None
 
 
 class ChangeArchive:
@@ -69,13 +74,19 @@ class ChangeArchive:
         shape: tuple[int, int],
         positive: float = 1.0,  # change per event of each polarity, in (mean) thresholds
         negative: float = 1.0,
+        start_bias: float = 0.0,  # thresholds beyond the reference at the start, on average
     ) -> None:
         # Units per event; not rounded, because rounding errors would accumulate
         self._positive, self._negative = self.STEPS * positive, self.STEPS * negative
         self._level = np.zeros(shape, np.float32)  # units, sum of events since the start
-        self._beyond = np.zeros(shape, np.int16)  # units beyond the last event's level
+        # Pixels that have not fired yet stand where they stood at the start
+        self._beyond = np.full(
+            shape, round(self.STEPS * start_bias), np.int16
+        )  # units beyond the last event's level
         self._last_frame = np.zeros(shape, np.int32)  # frame of the pixel's last event
         self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
+        self._total = np.zeros(shape, np.float32)  # units, sum of the events' sizes since the start
+        self._totals: dict[int, np.ndarray] = {}  # [H, W] uint16 by frame
 
     def __len__(self) -> int:
         return len(self._images)
@@ -92,10 +103,21 @@ class ChangeArchive:
         self._add_next_event(fired, self._bias(first[fired]))
         self._level += np.float32(self._positive) * counts.numbers[..., 1]
         self._level -= np.float32(self._negative) * counts.numbers[..., 0]
+        if counts.missed is not None:
+            self._level += np.float32(self._positive) * counts.missed[..., 1]
+            self._level -= np.float32(self._negative) * counts.missed[..., 0]
+        self._add_activity(counts)
         self._beyond.ravel()[fired] = self._bias(last[fired])
         self._last_frame.ravel()[fired] = index
         if is_kept:
             self._images[index] = np.rint(self._level).astype(np.int16) + self._beyond
+            self._totals[index] = np.minimum(self._total, 65535).astype(np.uint16)
+
+    def _add_activity(self, counts: EventCounts) -> None:
+        for polarity, worth in ((1, self._positive), (0, self._negative)):
+            self._total += np.float32(worth) * counts.numbers[..., polarity]
+            if counts.missed is not None:
+                self._total += np.float32(worth) * counts.missed[..., polarity]
 
     def _bias(self, polarity: np.ndarray) -> np.ndarray:  # [P] -> [P] int16
         """Return how many units brightness is beyond an event's level."""
@@ -116,12 +138,17 @@ class ChangeArchive:
         """Return the change from the start to a kept frame, in contrast thresholds."""
         return self._images[index].astype(np.float32) / self.STEPS
 
+    def activity(self, index: int) -> np.ndarray:  # [H, W] float32
+        """Return the sum of all changes from the start to a kept frame, up and down, in thresholds."""
+        return self._totals[index].astype(np.float32) / self.STEPS
+
     def drop(self, index: int) -> None:
         """Remove a frame's image."""
-        del self._images[index]
+        del self._images[index], self._totals[index]
 
-    def reset(self) -> np.ndarray:  # [H, W] float32
-        """Make now the start, and return the change since the old one; kept images stay unchanged."""
+    def reset(self) -> tuple[np.ndarray, np.ndarray]:  # [H, W] float32 each
+        """Make now the start; return change and activity since the old one. Kept images stay unchanged."""
         change = (self._level + self._beyond).astype(np.float32) / self.STEPS
-        self._level[:] = 0
-        return change
+        activity = self._total / self.STEPS
+        self._level[:], self._total[:] = 0, 0
+        return change, activity

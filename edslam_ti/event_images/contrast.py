@@ -13,7 +13,7 @@ over the surrounding pixels have independent noise, so they serve as instruments
 brighter, which determines C+ / C- where a sensor has noise events.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from edslam_ti.datasets.base import EventDepthSequence
 from edslam_ti.event_images.change import AVERAGE_BIAS
 from edslam_ti.events import Events
-from edslam_ti.frame import EventCounts
+from edslam_ti.frame import EventCounts, MissedChange
 
 DEFAULT = 0.1  # Sec. IV-A: 0.1 synthetic, 0.2 real
 GAPS = (1, 2, 4)  # difference of the indices of a pair of images
@@ -49,6 +49,9 @@ class ContrastThreshold:
     negative: float | None = None
     deviation: float | None = None  # standard deviation of `value` among the pairs of images (jackknife)
     notes: tuple[str, ...] = ()  # what looks wrong with the events, a line each
+    dead_time: float = 0.0  # seconds after an event in which its pixel is blind
+    start_bias: float = 0.0  # thresholds that brightness is beyond the references at the start, on average
+    has_faults: bool = False  # the events show dead time or noise
     deviations: tuple[float, float] | None = None  # the same of `positive` and `negative`
 
     @property
@@ -72,30 +75,34 @@ def contrast_threshold(
     sequence: EventDepthSequence,
     start: float,  # seconds
     end: float,
+    dead_time: float = 0.0,  # seconds
 ) -> ContrastThreshold:
     """Return the threshold that the settings or the data state, else an estimate, else the default.
 
     The settings state the mean; the ratio C+ / C- is estimated nevertheless.
     """
     in_data = sequence.contrast_threshold if stated is None else None
-    solution = _from_images(sequence, start, end, MAX_PAIRS if in_data is None else SIGN_PAIRS)
+    max_pairs = MAX_PAIRS if in_data is None else SIGN_PAIRS
+    solution = _from_images(sequence, start, end, max_pairs, dead_time)
     notes = solution.notes if solution else ()
     if in_data is not None:
-        return ContrastThreshold(in_data, "data", notes=notes)
+        return ContrastThreshold(in_data, "data", notes=notes, dead_time=dead_time)
     estimate = solution.threshold if solution else None
     if stated is not None:
         positive, negative = (stated * r for r in estimate.relative) if estimate else (None, None)
-        return ContrastThreshold(stated, "settings", positive, negative, notes=notes)
-    return estimate or ContrastThreshold(DEFAULT, "default", notes=notes)
+        return ContrastThreshold(stated, "settings", positive, negative, notes=notes, dead_time=dead_time)
+    found = estimate or ContrastThreshold(DEFAULT, "default", notes=notes)
+    return replace(found, dead_time=dead_time)
 
 
 def contrast_from_images(
     sequence: EventDepthSequence,
     start: float,  # seconds
     end: float,
+    dead_time: float = 0.0,  # seconds
 ) -> ContrastThreshold | None:
     """Return the threshold estimated from images in [start, end]; None if they do not suffice."""
-    solution = _from_images(sequence, start, end, MAX_PAIRS)
+    solution = _from_images(sequence, start, end, MAX_PAIRS, dead_time)
     return solution.threshold if solution else None
 
 
@@ -135,7 +142,9 @@ class _Solution:
         )
 
 
-def _from_images(sequence: EventDepthSequence, start: float, end: float, max_pairs: int) -> _Solution | None:
+def _from_images(
+    sequence: EventDepthSequence, start: float, end: float, max_pairs: int, dead_time: float
+) -> _Solution | None:
     """Return what images inside [start, end] say, None where there are too few of them or of events."""
     stamps = sequence.image_timestamps
     inside = np.nonzero((stamps >= start) & (stamps <= end))[0]
@@ -143,7 +152,7 @@ def _from_images(sequence: EventDepthSequence, start: float, end: float, max_pai
     for gap in GAPS:
         pairs = [(a, b) for a, b in zip(inside, inside[gap:]) if stamps[b] - stamps[a] <= LONGEST_PAIR]
         step = max(1, len(pairs) // max_pairs)
-        compared = (_products(sequence, int(a), int(b)) for a, b in pairs[::step][:max_pairs])
+        compared = (_products(sequence, int(a), int(b), dead_time) for a, b in pairs[::step][:max_pairs])
         products += [p for p in compared if p is not None]
     if len(products) < 2 or np.sum([p.events for p in products], 0).min() < MIN_EVENTS:
         return None
@@ -165,13 +174,13 @@ class _Products:
     events: np.ndarray  # [2] positive and negative ones
 
 
-def _products(sequence: EventDepthSequence, first: int, second: int) -> _Products | None:
+def _products(sequence: EventDepthSequence, first: int, second: int, dead_time: float) -> _Products | None:
     """Return the sums of a pair of images, None where one of them cannot be read."""
     before, after = sequence.image_or_none(first), sequence.image_or_none(second)
     if before is None or after is None:
         return None
     start, end = (float(sequence.image_timestamps[k]) for k in (first, second))
-    regressors = _regressors(sequence.events(start - HISTORY, end), start, before.shape)
+    regressors = _regressors(sequence.events(start - HISTORY, end), start, before.shape, dead_time)
     square = (cv2.boxFilter(r, -1, (RING, RING), normalize=False) for r in regressors)
     around = [s - cv2.boxFilter(r, -1, (3, 3), normalize=False) for s, r in zip(square, regressors)]
     usable = np.ones(before.shape, bool)
@@ -184,7 +193,9 @@ def _products(sequence: EventDepthSequence, first: int, second: int) -> _Product
     return _Products(Z @ X.T, Z @ change, np.abs(X).sum(1))
 
 
-def _regressors(events: Events, start: float, shape: tuple[int, int]) -> np.ndarray:  # [2, H, W] float32
+def _regressors(
+    events: Events, start: float, shape: tuple[int, int], dead_time: float
+) -> np.ndarray:  # [2, H, W] float32
     """Return p and -n from the start on, each corrected by the mean distance beyond the last event."""
     before = EventCounts(events.between(-np.inf, start), shape).last
     counts = EventCounts(events.between(start, np.inf), shape)
@@ -194,6 +205,11 @@ def _regressors(events: Events, start: float, shape: tuple[int, int]) -> np.ndar
         counts.numbers[..., k].astype(np.float32) + bias * (sign * last > 0) - bias * (sign * before > 0)
         for k, sign in ((1, 1), (0, -1))
     )
+    if dead_time > 0:
+        missed_change = MissedChange(shape, dead_time)
+        missed_change.of(events.between(-np.inf, start))
+        missed = missed_change.of(events.between(start, np.inf))
+        p, n = p + missed[..., 1], n + missed[..., 0]
     return np.stack([p, -n])
 
 

@@ -34,6 +34,7 @@ EQUAL = 1.2  # the two shortest intervals are one, if the other polarity's is wi
 DOUBTFUL = 2.2  # or perhaps if it is within this many times: images decide
 QUIET_BIN = 0.01  # s
 QUIET_AROUND = 7  # px, width of the neighbourhood that must be silent, in this bin and those beside it
+NOISE_RATE = 0.5  # Hz a pixel; rooms without noise give up to 0.3
 HOT_RATE, HOT_EVENTS = 20.0, 20  # Hz and number, at least, of a hot pixel's events
 
 
@@ -59,6 +60,11 @@ class SensorEstimate:
         if total[-1] == 0:
             return None
         return float(EDGES[1:][np.searchsorted(total, share * total[-1])])
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether there are more events of quiet pixels than a scene without noise has."""
+        return (self.noise_rate or 0.0) > NOISE_RATE
 
     @property
     def short_share(self) -> float:

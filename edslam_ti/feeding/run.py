@@ -11,8 +11,7 @@ from rich.console import Console
 
 from edslam_ti.config import Config
 from edslam_ti.errors import ConfigError, DataError, plain
-from edslam_ti.event_images.contrast import contrast_threshold
-from edslam_ti.event_images.sensor import estimate_sensor
+from edslam_ti.event_images.own_sensor import own_sensor
 from edslam_ti.feeding.cutter import Cut
 from edslam_ti.feeding.inlet import is_pose
 from edslam_ti.feeding.sequence import FedSamples, FedSequence
@@ -98,13 +97,12 @@ class FedRun:
     def begin(self, start: float, end: float, time_offset: float, on_tracked: Callable[[], None]) -> Run:
         """Build the method from what the sequence has gathered from `start` to `end` (seconds)."""
         sequence, config = self._sequence, self._config
-        contrast = contrast_threshold(config.contrast_threshold, sequence, start, end)
+        contrast, sensor = own_sensor(config.contrast_threshold, config.dead_time, sequence, start, end)
         tracker, mapper = METHODS[config.method].build(sequence, contrast, config)
-        sensor = estimate_sensor(sequence, start, end) if sequence.has_events else None
         sequence.forget()
         sequence.time_offset = time_offset
         slam = Slam(
-            FrameBuilder(sequence.camera),
+            FrameBuilder(sequence.camera, contrast.dead_time),
             tracker,
             mapper if config.mapping.enabled else None,
             self._initial_pose,

@@ -7,7 +7,7 @@ import numpy as np
 from edslam_ti.config import Config
 from edslam_ti.datasets import EventDepthSequence, SampledSequence
 from edslam_ti.errors import DataError
-from edslam_ti.event_images.contrast import contrast_threshold
+from edslam_ti.event_images.own_sensor import own_sensor
 from edslam_ti.frame import FrameBuilder
 from edslam_ti.slam import Slam
 from edslam_ti.tracking.consistency import Consistency, Misalignment
@@ -37,10 +37,15 @@ def track(sequence: EventDepthSequence, start: float, end: float, config: Config
         samples = SampledSequence(sequence, max(start - first, 0.0), end - start, config.max_interval)
     except DataError:
         return None
-    contrast = contrast_threshold(config.contrast_threshold, sequence, start, end)
+    contrast, _ = own_sensor(config.contrast_threshold, config.dead_time, sequence, start, end)
     tracker = BrightnessTracker(sequence.camera, contrast, config.time_surface, config.tracking, config.seed)
     truth = sequence.true_pose(float(samples.timestamps[0]))
-    slam = Slam(FrameBuilder(sequence.camera), tracker, None, np.eye(4) if truth is None else truth)
+    slam = Slam(
+        FrameBuilder(sequence.camera, contrast.dead_time),
+        tracker,
+        None,
+        np.eye(4) if truth is None else truth,
+    )
     for k in range(min(len(samples), MOST_FRAMES)):
         sample, _ = samples.as_far_as_readable(k)
         slam.process(sample)

@@ -33,6 +33,7 @@ LAST_RATE = 0.05  # learning rates fall to this share of their values during the
 WHITE_LEVEL = 0.93  # brightness given to the brightest percent of pixels
 SOLVE_EVERY = 5  # frames between two solves of the start image
 MAX_RECOLOURED = 8  # after each solve, Gaussians are recoloured from at most this many frames
+LEAST_ALPHA = 0.8  # where the map shows a surface
 SETTLING = (0.002, 0.1)  # metres, degrees: the map does not follow smaller changes of poses
 
 
@@ -124,6 +125,9 @@ class GaussianMapper(ShownMap):
         """Solve all start images; return where the final steps begin, None where nothing can be refined."""
         if len(self.gaussians) == 0 or not self._solve_brightness(trajectory, is_thorough=True):
             return None
+        for _ in range(self._config.compare_pixels):
+            if not self._solve_brightness(trajectory, is_thorough=True, compares_pixels=True):
+                break
         allowed = self.budget.left()
         densifier = self._densifier(trajectory) if self._config.densify else None
         return Refinement(allowed, densifier, is_aligned=not self._adjusts_poses)
@@ -240,14 +244,21 @@ class GaussianMapper(ShownMap):
 
     # --- optimising ---
 
-    def _solve_brightness(self, trajectory: Trajectory, is_thorough: bool = False) -> bool:
-        """Solve the start image and recolour the Gaussians; return whether the solve succeeded."""
+    def _solve_brightness(
+        self, trajectory: Trajectory, is_thorough: bool = False, compares_pixels: bool = False
+    ) -> bool:
+        """Solve the start image and recolour the Gaussians; return whether the solve succeeded.
+
+        `compares_pixels`: find each pixel's thresholds first; nothing to do where pixels are alike.
+        """
         was_solved, epsilon = self.images.is_solved, self._config.log_epsilon
         newest = evenly(self.images.newest_frames, MAX_RECOLOURED)
         changed = self.images.frames if is_thorough or not was_solved else newest
         if not changed:  # a window has just begun, and no frame of it is kept so far
             return was_solved
         before = {k: self.images.log_brightness(k) for k in changed} if was_solved else {}
+        if compares_pixels and not self._compare_pixels(trajectory):
+            return False
         if not self.images.solve(trajectory, is_thorough):
             return False
         if is_thorough or not was_solved:
@@ -261,6 +272,17 @@ class GaussianMapper(ShownMap):
 
         recolour(self.gaussians, views(), changed[0] <= self.images.frames[0], epsilon)
         return True
+
+    def _compare_pixels(self, trajectory: Trajectory) -> bool:
+        """Compare the events of each pixel with what the map shows; return whether pixels differ."""
+
+        def shown() -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+            for k in self.images.frames:
+                view = self._view(trajectory.pose(k))
+                log_brightness = np.log(view.intensity.numpy() + np.float32(self._config.log_epsilon))
+                yield k, log_brightness, view.alpha.numpy() > LEAST_ALPHA
+
+        return self.images.compare(shown())
 
     def _optimise(
         self,

@@ -4,7 +4,7 @@ Every window of a few seconds of events has one start image. Grey images, where 
 and fix the start image.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,6 +16,7 @@ from edslam_ti.depth_images import block_means, with_holes_filled
 from edslam_ti.event_images.change import ChangeArchive
 from edslam_ti.event_images.contrast import ContrastThreshold
 from edslam_ti.event_images.noisy import NoisyPixels
+from edslam_ti.event_images.pixel_thresholds import Compared, PixelThresholds, fit_pixel_thresholds
 from edslam_ti.event_images.sharp import SharpImage, SharpImages
 from edslam_ti.event_images.solve import EventView, solve_start_image
 from edslam_ti.frame import Frame
@@ -25,6 +26,7 @@ MIN_VIEWS = 3  # frames needed before a start image can be solved
 QUICK = {4: 60}  # solver iterations for each reduction of the images, during the run
 THOROUGH = {4: 100, 2: 80}  # the same at the end
 GIVEN_VIEWS = 6  # frames of earlier windows that a start image is tied to
+LEAST_SPREAD = 0.04  # of pixels' thresholds; a smaller one may be the map's errors
 DETAIL_SIGMA = 4.0  # px; details smaller than this are learned from renders
 DETAIL_RATE = 0.1  # share of a render's difference that is added to the start image
 
@@ -57,11 +59,13 @@ class EventImages:
         self._contrast_threshold = contrast.value
         self._config = config
         self._sharp_images = sharp_images
-        self._archive = ChangeArchive(camera.shape, *contrast.relative)
+        self._archive = ChangeArchive(camera.shape, *contrast.relative, contrast.start_bias)
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
         self._windows: list[_Window] = []
         self.noisy_pixels = NoisyPixels(camera.shape)
+        self._pixels: PixelThresholds | None = None  # None: all pixels are alike
+        self._may_differ = contrast.has_faults  # ideal pixels are alike
         self._started = -np.inf  # time of the current window's first frame
 
     @property
@@ -89,7 +93,9 @@ class EventImages:
             level = np.float32(np.log(self._config.background))
             self._begin(index, frame.timestamp, np.full(self._camera.shape, level))
         elif frame.timestamp - self._started > self._config.stretch:
-            change = self._contrast_threshold * self._archive.reset()
+            change, activity = (self._contrast_threshold * part for part in self._archive.reset())
+            if self._pixels is not None:
+                change = self._pixels.corrected(change, activity)
             self._begin(index + 1, frame.timestamp, self._windows[-1].start + change)
 
     def forget_depth(self, frames: Sequence[int]) -> None:
@@ -163,6 +169,28 @@ class EventImages:
             in_use = {self._window_of(k).first for k in self.frames}
             self._windows = [s for s in self._windows[:-1] if s.first in in_use] + self._windows[-1:]
 
+    def compare(self, shown: Iterable[tuple[int, np.ndarray, np.ndarray]]) -> bool:
+        """Find how pixels' thresholds differ; return whether they do, so that all images have changed.
+
+        `shown`: a frame, the map's log brightness [H, W], and where it shows a surface [H, W].
+        """
+        if not self._may_differ:
+            return False
+        C = np.float32(self._contrast_threshold)
+
+        def compared() -> Iterator[Compared]:
+            for k, brightness, is_shown in shown:
+                window = self._window_of(k)
+                change, activity = C * self._archive.change(k), C * self._archive.activity(k)
+                difference = brightness - (window.start + change)
+                yield Compared(window.first, difference, change, activity, is_shown)
+
+        found = fit_pixel_thresholds(compared(), self._camera.shape)
+        if self._pixels is None and found.spread < LEAST_SPREAD:
+            return False
+        self._pixels = found
+        return True
+
     def _add_grey(self, frame: Frame, index: int) -> None:
         grey = None if self._sharp_images is None else self._sharp_images.at(frame)
         if grey is not None:
@@ -193,6 +221,9 @@ class EventImages:
 
     def _change(self, index: int) -> np.ndarray:
         change = np.float32(self._contrast_threshold) * self._archive.change(index)
+        if self._pixels is not None:
+            activity = np.float32(self._contrast_threshold) * self._archive.activity(index)
+            change = self._pixels.corrected(change, activity)
         return self.noisy_pixels.replaced(change)
 
     def _view(self, index: int, trajectory: Trajectory, is_relative: bool) -> EventView:
