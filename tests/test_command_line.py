@@ -139,7 +139,8 @@ def test_built_in_room_stands_in_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "edslam_ti.datasets.builtin.builtin_sequence_folder", lambda scene: write_sequence(tmp_path / scene)
+        "edslam_ti.datasets.builtin.builtin_sequence_folder",
+        lambda scene, settings: write_sequence(tmp_path / scene),
     )
     sequence = open_asked("--scene", "room2", "--data-dir", str(tmp_path / "nowhere"))
     assert (sequence.dataset, sequence.scene) == ("builtin", "room2")

@@ -490,7 +490,7 @@ def test_interrupt_before_the_first_frame_leaves_nothing(
     def interrupted(*arguments: Any, **options: Any) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(pipeline, "contrast_of", interrupted)
+    monkeypatch.setattr(pipeline, "own_sensor", interrupted)
     with pytest.raises(KeyboardInterrupt):
         quiet_run(config_for(tiny_folder, tmp_path))
     assert list(tmp_path.iterdir()) == []
