@@ -134,9 +134,13 @@ def test_live_page_shows_a_run_and_follows_and_the_finished_run_flies(
     number = re.compile(r"frame (\d+) of")
     until(lambda: number.search(browser.text()) is not None, 200)
     wide = "[...document.images].filter(i => i.naturalWidth > 100).length"
-    is_shown = lambda: browser.ask(wide) >= 2 and scene(browser.picture("live")).std() > 20  # noqa: E731
-    print(f"splats and images {until(is_shown, SECONDS):.1f} s after the first frame on the page")
     numbers, has_path = set[str](), False
+
+    def is_shown() -> bool:
+        numbers.update(number.findall(browser.text()))
+        return browser.ask(wide) >= 2 and bool(scene(browser.picture("live")).std() > 20)
+
+    print(f"splats and images {until(is_shown, SECONDS):.1f} s after the first frame on the page")
     while run.poll() is None and not (len(numbers) > 1 and has_path):
         numbers |= set(number.findall(browser.text()))
         has_path = colour_share(scene(browser.picture("live")), (178, 114, 0)) > 2e-4
