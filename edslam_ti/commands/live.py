@@ -7,7 +7,7 @@ Messages, directories and drivers are described in docs/live.md.
     edslam live --play office0 --pace 1                a recording, as if it were happening now
     edslam live --listen 5700                          messages of another process on this machine
     edslam live --send office0 --to 5700 --pace 1      that process: send a recording
-    edslam live --listen unix:/tmp/slam.sock
+    edslam live --listen unix:slam.sock
     edslam live --listen -                             messages from standard input
     edslam live --folder incoming                      files that another process renames into a folder
     edslam live --camera neuromorphic --depth-camera realsense --calibration camera.json
