@@ -26,7 +26,8 @@ from edslam_ti.kernels.engine import ti
 from edslam_ti.kernels.event_simulation import (
     MIN_THRESHOLD,
     EventArrays,
-    order_in_time,
+    check_frames,
+    in_two_passes,
 )
 from edslam_ti.kernels.hashing import hashed_normal, hashed_uniform
 from edslam_ti.kernels.runtime import check_shape
@@ -197,14 +198,9 @@ def sensed_events(
     seed: int = 0,
 ) -> EventArrays:
     """Return the events fired in (start, end] and advance the pixels' state."""
-    shape = log_start.shape
-    check_shape("log_start", log_start, (None, None))
-    check_shape("log_end", log_end, shape)
-    check_shape("state.reference", state.reference, shape)
-    check_shape("traits.positive", traits.positive, shape)
-    if end <= start:
-        raise ValueError(f"frame times: expected start < end, got {start} and {end} ns")
-    counts = np.empty(shape, np.int32)
+    check_frames(log_start, log_end, start, end)
+    check_shape("state.reference", state.reference, log_start.shape)
+    check_shape("traits.positive", traits.positive, log_start.shape)
     substeps = -(-(end - start) // LONGEST_SUBSTEP) if bandwidth > 0 else 1
     fixed = (
         log_start,
@@ -224,15 +220,7 @@ def sensed_events(
         *(state.next_noise, state.num_noise, state.num_events),
     )
 
-    def launch(fill: int, offsets: np.ndarray, total: int) -> tuple[np.ndarray, ...]:
-        size = max(total, 1)  # Taichi takes no empty arrays
-        t, polarity = np.empty(size, np.int64), np.empty(size, np.int8)
-        x, y = np.empty(size, np.int16), np.empty(size, np.int16)
-        _sense(*fixed, fill, *pixels, *memory, counts, offsets, t, x, y, polarity)
-        return t[:total], x[:total], y[:total], polarity[:total]
+    def run(fill: int, *outputs: np.ndarray) -> None:
+        _sense(*fixed, fill, *pixels, *memory, *outputs)
 
-    launch(0, np.zeros(shape, np.int64), 0)
-    ends = np.cumsum(counts, dtype=np.int64).reshape(shape)
-    times, x, y, polarity = launch(1, ends - counts, int(ends[-1, -1]))
-    order = order_in_time(times, start, end)
-    return EventArrays(x[order], y[order], times[order], polarity[order])
+    return in_two_passes(run, log_start.shape, start, end)

@@ -14,6 +14,7 @@ Times are whole nanoseconds. Two passes, count and fill, need no atomics; events
 then by pixel.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,14 +136,8 @@ def simulate_events(
     seed: int = 0,
 ) -> EventArrays:
     """Return the events fired in (start, end] and advance the sensor's state."""
-    shape = log_start.shape
-    check_shape("log_start", log_start, (None, None))
-    check_shape("log_end", log_end, shape)
-    check_shape("state.reference", state.reference, shape)
-    if log_start.dtype != np.float32 or log_end.dtype != np.float32:
-        raise ValueError(f"log intensity: expected float32, got {log_start.dtype} and {log_end.dtype}")
-    if end <= start:
-        raise ValueError(f"frame times: expected start < end, got {start} and {end} ns")
+    check_frames(log_start, log_end, start, end)
+    check_shape("state.reference", state.reference, log_start.shape)
     if min(positive_threshold, negative_threshold) < MIN_THRESHOLD:
         raise ValueError(
             f"contrast threshold: expected at least {MIN_THRESHOLD}, got "
@@ -150,22 +145,45 @@ def simulate_events(
         )
     if threshold_noise < 0 or refractory_period < 0:
         raise ValueError("threshold noise and refractory period: expected values of at least 0")
-    counts = np.empty(shape, np.int32)
     thresholds = (positive_threshold, negative_threshold, threshold_noise)
     memory = (state.reference, state.num_crossings, state.last_event)
     fixed = (log_start, log_end, start, end, *thresholds, refractory_period, seed & 0xFFFFFFFF)
+
+    def run(fill: int, *outputs: np.ndarray) -> None:
+        _cross_thresholds(*fixed, fill, *memory, *outputs)
+
+    return in_two_passes(run, log_start.shape, start, end)
+
+
+def check_frames(log_start: np.ndarray, log_end: np.ndarray, start: int, end: int) -> None:
+    """Raise ValueError unless there are two images [H, W] float32 of one size, and time between them."""
+    check_shape("log_start", log_start, (None, None))
+    check_shape("log_end", log_end, log_start.shape)
+    if log_start.dtype != np.float32 or log_end.dtype != np.float32:
+        raise ValueError(f"log intensity: expected float32, got {log_start.dtype} and {log_end.dtype}")
+    if end <= start:
+        raise ValueError(f"frame times: expected start < end, got {start} and {end} ns")
+
+
+def in_two_passes(
+    run: Callable[..., None],  # of fill, counts [H, W], offsets [H, W], t [N], x [N], y [N], polarity [N]
+    shape: tuple[int, ...],  # (H, W)
+    start: int,  # nanoseconds
+    end: int,
+) -> EventArrays:
+    """Let a kernel count every pixel's events (fill 0), then write them (fill 1); return them by time."""
+    counts = np.empty(shape, np.int32)
 
     def launch(fill: int, offsets: np.ndarray, total: int) -> tuple[np.ndarray, ...]:
         size = max(total, 1)  # Taichi takes no empty arrays
         t, polarity = np.empty(size, np.int64), np.empty(size, np.int8)
         x, y = np.empty(size, np.int16), np.empty(size, np.int16)
-        _cross_thresholds(*fixed, fill, *memory, counts, offsets, t, x, y, polarity)
+        run(fill, counts, offsets, t, x, y, polarity)
         return t[:total], x[:total], y[:total], polarity[:total]
 
     launch(0, np.zeros(shape, np.int64), 0)
     ends = np.cumsum(counts, dtype=np.int64).reshape(shape)
-    total = int(ends[-1, -1])
-    times, x, y, polarity = launch(1, ends - counts, total)
+    times, x, y, polarity = launch(1, ends - counts, int(ends[-1, -1]))
     order = order_in_time(times, start, end)
     return EventArrays(x[order], y[order], times[order], polarity[order])
 
