@@ -118,18 +118,12 @@ def read_camera(path: Path) -> CameraFile:
         values.pop("distortion")  # zeros, whatever their number
     if isinstance(values.get("description"), str):
         values["description"] = plain(values["description"])
-    try:
-        result = CameraFile.model_validate(
-            {k: int(v) if isinstance(v, float) and v.is_integer() and k in ("width", "height") else v
-             for k, v in values.items() if k in CameraFile.model_fields}
-        )  # fmt: skip
-        result.lens  # noqa: B018  its own checks
-    except ValidationError as error:
-        problem = error.errors()[0]
-        name = ".".join(str(part) for part in problem["loc"])
-        raise DataError(f"{path}: {name}: {problem['msg']}, got {shown(problem['input'])}") from error
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+    known = {
+        k: int(v) if isinstance(v, float) and v.is_integer() and k in ("width", "height") else v
+        for k, v in values.items()
+        if k in CameraFile.model_fields
+    }
+    result = validated(known, str(path))
     if not (0 < result.cx < result.width and 0 < result.cy < result.height):
         raise DataError(
             f"{path}: expected the principal point inside the {result.width}x{result.height} image, got "
@@ -165,3 +159,17 @@ def _check_key(path: Path, key: str) -> None:
     close = difflib.get_close_matches(key.lower(), CameraFile.model_fields, n=1, cutoff=0.8)
     if close:
         raise DataError(f"{path}: unknown key '{plain(key)}'; did you mean '{close[0]}'?")
+
+
+def validated(values: dict[str, Any], where: str) -> CameraFile:
+    """Return a camera from its fields; raises DataError naming `where` and the first field that is wrong."""
+    try:
+        file = CameraFile.model_validate(values)
+        file.lens  # noqa: B018  its own checks
+    except ValidationError as error:
+        problem = error.errors()[0]
+        name = ".".join(str(part) for part in problem["loc"])
+        raise DataError(f"{where}: {plain(name)}: {problem['msg']}, got {shown(problem['input'])}") from error
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+    return file

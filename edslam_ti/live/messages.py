@@ -21,10 +21,9 @@ from typing import Any, get_args
 
 import cv2
 import numpy as np
-from pydantic import ValidationError
 
 from edslam_ti.camera import LARGEST_SIDE
-from edslam_ti.datasets.camera_file import CameraFile
+from edslam_ti.datasets.camera_file import validated
 from edslam_ti.datasets.files import PNG_SIGNATURE, decode_bytes
 from edslam_ti.errors import DataError, plain, shown
 from edslam_ti.feeding.intake import DepthUnit, TimeUnit
@@ -174,15 +173,7 @@ def camera_item(values: Any, where: str) -> CameraItem:
             raise DataError(
                 f"{where}: {name}: expected one of {', '.join(get_args(kind))}, got {shown(values[name])}"
             )
-    try:
-        file = CameraFile.model_validate(known)
-        file.lens  # noqa: B018  its own checks
-    except ValidationError as error:
-        problem = error.errors()[0]
-        name = ".".join(str(part) for part in problem["loc"])
-        raise DataError(f"{where}: {plain(name)}: {problem['msg']}, got {shown(problem['input'])}") from error
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    file = validated(known, where)
     if file.width * file.height > LARGEST[DEPTH] // 4 or max(file.width, file.height) > LARGEST_SIDE:
         raise DataError(f"{where}: {file.width}x{file.height} pixels are too many for a message")
     pose = values.get("initial_pose")
