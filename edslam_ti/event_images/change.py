@@ -75,6 +75,7 @@ class ChangeArchive:
         positive: float = 1.0,  # change per event of each polarity, in (mean) thresholds
         negative: float = 1.0,
         start_bias: float = 0.0,  # thresholds beyond the reference at the start, on average
+        keeps_activity: bool = False,  # for `activity`
     ) -> None:
         # Units per event; not rounded, because rounding errors would accumulate
         self._positive, self._negative = self.STEPS * positive, self.STEPS * negative
@@ -85,6 +86,7 @@ class ChangeArchive:
         )  # units beyond the last event's level
         self._last_frame = np.zeros(shape, np.int32)  # frame of the pixel's last event
         self._images: dict[int, np.ndarray] = {}  # [H, W] int16 by frame
+        self._keeps_activity = keeps_activity
         self._total = np.zeros(shape, np.float32)  # units, sum of the events' sizes since the start
         self._totals: dict[int, np.ndarray] = {}  # [H, W] uint16 by frame
 
@@ -106,12 +108,14 @@ class ChangeArchive:
         if counts.missed is not None:
             self._level += np.float32(self._positive) * counts.missed[..., 1]
             self._level -= np.float32(self._negative) * counts.missed[..., 0]
-        self._add_activity(counts)
+        if self._keeps_activity:
+            self._add_activity(counts)
         self._beyond.ravel()[fired] = self._bias(last[fired])
         self._last_frame.ravel()[fired] = index
         if is_kept:
             self._images[index] = np.rint(self._level).astype(np.int16) + self._beyond
-            self._totals[index] = np.minimum(self._total, 65535).astype(np.uint16)
+            if self._keeps_activity:
+                self._totals[index] = np.minimum(self._total, 65535).astype(np.uint16)
 
     def _add_activity(self, counts: EventCounts) -> None:
         for polarity, worth in ((1, self._positive), (0, self._negative)):
@@ -144,7 +148,8 @@ class ChangeArchive:
 
     def drop(self, index: int) -> None:
         """Remove a frame's image."""
-        del self._images[index], self._totals[index]
+        del self._images[index]
+        self._totals.pop(index, None)
 
     def reset(self) -> tuple[np.ndarray, np.ndarray]:  # [H, W] float32 each
         """Make now the start; return change and activity since the old one. Kept images stay unchanged."""

@@ -59,7 +59,9 @@ class EventImages:
         self._contrast_threshold = contrast.value
         self._config = config
         self._sharp_images = sharp_images
-        self._archive = ChangeArchive(camera.shape, *contrast.relative, contrast.start_bias)
+        self._archive = ChangeArchive(
+            camera.shape, *contrast.relative, contrast.start_bias, keeps_activity=contrast.has_faults
+        )
         self._depths: dict[int, np.ndarray | None] = {}
         self._grey: dict[int, SharpImage] = {}  # by frame
         self._windows: list[_Window] = []
