@@ -5,6 +5,7 @@ EDSLAM_SCREENSHOTS=DIR also keeps pictures of the pages, EDSLAM_SECONDS=30 is fo
 """
 
 import base64
+import contextlib
 import itertools
 import json
 import os
@@ -27,6 +28,12 @@ CHROMIUM = os.environ.get("EDSLAM_CHROMIUM", "")
 if not Path(CHROMIUM).is_file():
     pytest.skip(f"EDSLAM_CHROMIUM names no browser ('{CHROMIUM}')", allow_module_level=True)
 SECONDS = float(os.environ.get("EDSLAM_SECONDS", "5"))  # from the first frame until all is shown
+# Clicks the check box beside a text.
+CHECK = """(() => {
+    let part = [...document.querySelectorAll("*")].filter(e => e.innerText == "%s").at(-1);
+    while (!part.querySelector("input[type=checkbox]")) part = part.parentElement;
+    part.querySelector("input[type=checkbox]").click();
+})()"""
 PICTURES = os.environ.get("EDSLAM_SCREENSHOTS", "")
 FLAGS = [
     *("--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
@@ -103,16 +110,21 @@ def until(condition: Any, seconds: float) -> float:
     return time.perf_counter() - started
 
 
-def served(*arguments: str) -> tuple[subprocess.Popen[str], str]:
-    """Start a command; return it and the address of its page."""
+@contextlib.contextmanager
+def served(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start a command; give it and the address of its page, and end it afterwards."""
     code = "from edslam_ti.commands import main; main()"
     command = [sys.executable, "-c", code, *arguments, "--viewer", "--viewer-port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    for line in process.stdout:
-        if match := re.search(r"page: (http://\S+)", line):
-            return process, match[1]
-    raise AssertionError("it served no page")
+    try:
+        found = (re.search(r"page: (http://\S+)", line) for line in process.stdout)
+        address = next((match[1] for match in found if match), None)
+        assert address is not None, "it served no page"
+        yield process, address
+    finally:
+        process.terminate()
+        process.wait(timeout=60)
 
 
 def scene(picture: np.ndarray) -> np.ndarray:
@@ -129,35 +141,33 @@ def test_live_page_shows_a_run_and_follows_and_the_finished_run_flies(
     browser: Browser, tmp_path: Path
 ) -> None:
     few = ("--mapping.final-iterations", "20", "--out", str(tmp_path))
-    run, address = served("slam", "--scene", "office0", *few)
-    browser.do("Page.navigate", url=address)
-    number = re.compile(r"frame (\d+) of")
-    until(lambda: number.search(browser.text()) is not None, 200)
-    wide = "[...document.images].filter(i => i.naturalWidth > 100).length"
-    numbers, has_path = set[str](), False
+    with served("slam", "--scene", "office0", *few) as (run, address):
+        browser.do("Page.navigate", url=address)
+        number = re.compile(r"frame (\d+) of")
+        until(lambda: number.search(browser.text()) is not None, 200)
+        wide = "[...document.images].filter(i => i.naturalWidth > 100).length"
+        numbers, has_path = set[str](), False
 
-    def is_shown() -> bool:
-        numbers.update(number.findall(browser.text()))
-        return browser.ask(wide) >= 2 and bool(scene(browser.picture("live")).std() > 20)
+        def is_shown() -> bool:
+            numbers.update(number.findall(browser.text()))
+            return browser.ask(wide) >= 2 and bool(scene(browser.picture("live")).std() > 20)
 
-    print(f"splats and images {until(is_shown, SECONDS):.1f} s after the first frame on the page")
-    while run.poll() is None and not (len(numbers) > 1 and has_path):
-        numbers |= set(number.findall(browser.text()))
-        has_path = colour_share(scene(browser.picture("live")), (178, 114, 0)) > 2e-4
-    assert len(numbers) > 1
-    assert has_path
-    assert run.wait(timeout=600) == 0
+        print(f"splats and images {until(is_shown, SECONDS):.1f} s after the first frame on the page")
+        while run.poll() is None and not (len(numbers) > 1 and has_path):
+            numbers |= set(number.findall(browser.text()))
+            has_path = colour_share(scene(browser.picture("live")), (178, 114, 0)) > 2e-4
+        assert len(numbers) > 1
+        assert has_path
+        assert run.wait(timeout=600) == 0
 
-    view, address = served("view", str(tmp_path / "builtin/office0/ed_slam/latest"))
-    browser.do("Page.navigate", url=address)
-    until(lambda: scene(browser.picture("finished")).std() > 20, 120)
-    browser.ask("[...document.querySelectorAll('input[type=checkbox]')].at(0).click()")
-    time.sleep(5)
-    before = scene(browser.picture("flight_begins"))
-    browser.ask("[...document.querySelectorAll('button')].find(b => b.innerText == 'Play').click()")
-    time.sleep(5)
-    after = scene(browser.picture("flight_ends"))
-    assert before.std() > 20
-    assert np.abs(after.astype(int) - before).mean() > 5
-    view.terminate()
-    view.wait(timeout=60)
+    with served("view", str(tmp_path / "builtin/office0/ed_slam/latest")) as (_, address):
+        browser.do("Page.navigate", url=address)
+        until(lambda: scene(browser.picture("finished")).std() > 20, 120)
+        browser.ask(CHECK % "Fly with the camera")
+        time.sleep(5)
+        before = scene(browser.picture("flight_begins"))
+        browser.ask("[...document.querySelectorAll('button')].find(b => b.innerText == 'Play').click()")
+        time.sleep(5)
+        after = scene(browser.picture("flight_ends"))
+        assert before.std() > 20
+        assert np.abs(after.astype(int) - before).mean() > 5
