@@ -180,6 +180,7 @@ class WrappedSequence(EventDepthSequence):
         return self._sequence.novel_views()
 
 
+FIRST_HISTORY = 0.1  # s of events that the first sample has
 MIN_HISTORY = 0.02  # s of events before the first sample, so that its time surface is not empty
 ROUNDING = 0.02 + 1e-4  # of the longest interval: 20 Hz in whole milliseconds are at times 51 ms apart
 SAME_TIME = 1e-6  # s; float64 seconds since the epoch are multiples of 2.4e-7
@@ -272,7 +273,7 @@ class SampledSequence:
     def __getitem__(self, k: int) -> Sample:
         sample = self.without_events(k)
         # The first sample gets some earlier events so that its time surface is not empty.
-        previous = float(self.timestamps[k - 1]) if k else sample.timestamp - 0.1
+        previous = float(self.timestamps[k - 1]) if k else sample.timestamp - FIRST_HISTORY
         return replace(sample, events=self.sequence.events(previous, sample.timestamp))
 
     def as_far_as_readable(self, k: int) -> tuple[Sample, str]:
@@ -290,7 +291,7 @@ class SampledSequence:
                 problems.append(str(error))
                 return otherwise
 
-        start, index = float(self.timestamps[k - 1]) if k else t - 0.1, int(self._depth_index[k])
+        start, index = float(self.timestamps[k - 1]) if k else t - FIRST_HISTORY, int(self._depth_index[k])
         events = read(lambda: sequence.events(start, t), Events.empty())
         depth = read(lambda: sequence.depth(index) if self.has_depth[k] else None, None)
         image = read(lambda: sequence.image_at(t), None)

@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 
-from edslam_ti.datasets.base import EventDepthSequence
+from edslam_ti.datasets.base import FIRST_HISTORY, EventDepthSequence
 from edslam_ti.errors import DataError
 from edslam_ti.event_images.contrast import ContrastThreshold, contrast_threshold
 from edslam_ti.event_images.sensor import SensorEstimate, estimate_sensor
 from edslam_ti.event_images.start_bias import start_bias
-
-EARLIER = 0.1  # seconds of events before the first sample, which has them, too
 
 
 def own_sensor(
@@ -28,7 +26,7 @@ def own_sensor(
     found = contrast_threshold(threshold, sequence, start, end, dead_time)
     if not dead_time and (sensor is None or not sensor.is_noisy):
         return found, sensor
-    begin = max(start - EARLIER, sequence.time_range[0])
+    begin = max(start - FIRST_HISTORY, sequence.time_range[0])
     bias = start_bias(sequence, begin, found.relative)
     return replace(found, start_bias=bias, has_faults=True), sensor
 

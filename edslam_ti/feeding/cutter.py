@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from edslam_ti.datasets import Sample
-from edslam_ti.datasets.base import MIN_HISTORY, SAME_TIME, times_between
+from edslam_ti.datasets.base import FIRST_HISTORY, MIN_HISTORY, SAME_TIME, times_between
 from edslam_ti.events import Events
 from edslam_ti.feeding.intake import Counts
 
-FIRST_HISTORY = 0.1  # s of events before the first sample, as SampledSequence takes
 SAME_MOMENT = 1e-3  # s between a sample and its grey image
 LONGEST_GAP = 60.0  # s between two depth images that is still divided into samples
 MOST_WAITING = 30_000_000  # events that are kept while a depth image is waited for: 400 MB

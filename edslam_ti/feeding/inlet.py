@@ -8,7 +8,7 @@ import numpy as np
 
 from edslam_ti.config import Config
 from edslam_ti.errors import DataError
-from edslam_ti.feeding.cutter import Cut, SampleCutter
+from edslam_ti.feeding.cutter import SAME_MOMENT, Cut, SampleCutter
 from edslam_ti.feeding.intake import Intake
 from edslam_ti.feeding.sequence import FedSequence
 
@@ -111,7 +111,9 @@ class Inlet:
         cutter = self._cutter
         if self.has_begun or cutter.clock == math.inf:
             return False
-        if self._needs_images and (not cutter.depths or cutter.newest_image < cutter.depths[0][0] - 1e-3):
+        if self._needs_images and (
+            not cutter.depths or cutter.newest_image < cutter.depths[0][0] - SAME_MOMENT
+        ):
             return True  # methods ask for two depth images with images
         return self._estimates_contrast and bool(cutter.images) and cutter.clock < first + GATHERED
 
